@@ -51,7 +51,14 @@ def main() -> None:
         start = time.perf_counter()
         people.append(generate(model, seed, arguments.steps))
         seconds.append(time.perf_counter() - start)
-    width, columns = arguments.width, min(arguments.columns, arguments.count)
+    Image.fromarray(sheet(people, arguments.columns, arguments.width)).save(arguments.out, optimize=True)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({"seconds_sample": float(np.median(seconds))}), encoding="utf-8")
+
+
+def sheet(people: list[Human], columns: int, width: int) -> np.ndarray:
+    """The sheet, sRGB bytes [height, width, 3], with so many small pictures in a row."""
+    columns = min(columns, len(people))
     tall = (width // columns, width // columns * 7 // 4)
     large = min(width // LARGE, len(people))
     rows = [
@@ -60,9 +67,7 @@ def main() -> None:
         *grid(people[:large], large, width, lambda human: whole(human, width // large)),
         *grid(people[: 2 * large], 2 * large, width, lambda human: head(human, width // (2 * large))),
     ]
-    Image.fromarray(np.concatenate(rows, 0)).save(arguments.out, optimize=True)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"seconds_sample": float(np.median(seconds))}), encoding="utf-8")
+    return np.concatenate(rows, 0)
 
 
 def grid(people: list[Human], columns: int, width: int, picture: Picture) -> list[np.ndarray]:

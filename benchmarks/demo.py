@@ -64,15 +64,13 @@ def main() -> None:
 
     stage("build the extension", "build_addon.py", "--out", out, figures_file=False)
     archive = next(out.glob("primdiffusion-*.zip"))
-    stage("generate a person in Blender", "benchmarks/demo_stages.py", "person", "--zip", archive, "--blend", blend,
-          "--human", human, "--seed", str(arguments.seed), "--frames", str(FRAMES), "--shown", str(SHOWN))  # fmt: skip
-    if not arguments.quick:
-        frame = out / "cycles.png"
-        stage("Cycles, 384 x 384", "benchmarks/demo_stages.py", "cycles", "--blend", blend, "--out", frame)
-    walk = ("--frames", str(FRAMES), "--frame", str(SHOWN))
-    stage("march five pictures", "benchmarks/demo_stages.py", "march", "--human", human, *walk, "--out", out)
+    made = ("--human", human, "--skinned", logs / "skinned.npz", "--frames", str(FRAMES))
+    frame = () if arguments.quick else ("--cycles", out / "cycles.png")
+    stage("a person in Blender" + ("" if arguments.quick else ", in Cycles"), "benchmarks/demo_blender.py", *made,
+          "--zip", archive, "--blend", blend, "--seed", str(arguments.seed), "--shown", str(SHOWN), *frame)  # fmt: skip
     count = "4" if arguments.quick else "6"
-    stage("contact sheet", "benchmarks/contact_sheet.py", "--count", count, "--out", out / "contact_sheet.png")
+    stage("pictures by the marcher", "benchmarks/demo_pictures.py", *made,
+          "--frame", str(SHOWN), "--count", count, "--out", out)  # fmt: skip
     if arguments.json is not None and arguments.assets is not None:
         options = ["--quick"] if arguments.quick else []
         stage("people against meshes", "benchmarks/people.py", "--assets", arguments.assets, *options)

@@ -59,8 +59,7 @@ def own_folder() -> Path:
 
 
 def cache_folder() -> Path | None:
-    """Folder for the children's byte code and compiled kernels; None in a checkout: beside its sources, where its
-    commands find them too."""
+    """Folder for the children's compiled kernels; None in a checkout: beside its sources, where its commands look."""
     if named := os.environ.get(CACHE_VARIABLE, ""):
         return Path(named).absolute()
     return own_folder() / "cache" if EXTENSION.startswith("bl_ext.") else None

@@ -91,7 +91,8 @@ def child_environment(module_path: Path | None, cache_dir: Path | None, extra: M
     """The environment of a backend process: the variables that `passed_on` gives, ours, and `extra`.
 
     `module_path` is the folder that holds the package `primdiffusion` (`bundled` in the zip); it goes before
-    anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.
+    anything installed. `cache_dir` takes compiled kernels. Byte code stays beside its sources: an installed torch
+    has it, and compiling it once more took 7 s of the first press.
     """
     environment = passed_on(COMPUTING)
     environment.update(PYTHONSAFEPATH="1")  # never import from the current folder
@@ -99,7 +100,7 @@ def child_environment(module_path: Path | None, cache_dir: Path | None, extra: M
     if module_path is not None:
         environment["PYTHONPATH"] = str(module_path)
     if cache_dir is not None:
-        environment.update(PYTHONPYCACHEPREFIX=str(cache_dir / "bytecode"), NUMBA_CACHE_DIR=str(cache_dir / "numba"))
+        environment.update(NUMBA_CACHE_DIR=str(cache_dir / "numba"))
     environment.update(extra)
     return environment
 

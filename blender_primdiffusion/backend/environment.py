@@ -202,8 +202,8 @@ def search(
     if module_path is not None:
         advice = f"press Set Up Backend, or {advice}"
     if any(isinstance(error, ImportTimedOut) for error in errors):
-        raise ImportTimedOut(f"No Python for the backend: {reasons}. The machine may be busy: try again, or {advice}.")
-    raise BackendNotFound(f"No Python for the backend: {reasons}. To go on, {advice}.")
+        raise ImportTimedOut(f"No Python for the backend: the machine may be busy, try again; or {advice}. {reasons}.")
+    raise BackendNotFound(f"No Python for the backend: {advice}. {reasons}.")  # Blender's report cuts the end
 
 
 def _try(

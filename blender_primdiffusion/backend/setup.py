@@ -42,7 +42,7 @@ _INSTALL = (
     "install", "--require-hashes", "--no-deps", "--only-binary", ":all:", "--no-compile", "--no-warn-script-location",
     "--disable-pip-version-check", "--no-input", "--no-color", "--progress-bar", "off",
 )  # fmt: skip
-"""Named wheels of known hashes alone, nothing built. The child keeps byte code in the extension's cache."""
+"""Named wheels of known hashes alone, nothing built. The self-test compiles what the child imports."""
 
 
 def set_up(

@@ -99,10 +99,12 @@ def draw_motion(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 
 def _draw_action(layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:
-    row = layout.row()
-    row.context_pointer_set("animated_id", armature)
-    row.template_action(armature, unlink="action.unlink")
     action = armature.animation_data.action if armature.animation_data else None
+    if bpy.data.actions:
+        row = layout.row()
+        row.context_pointer_set("animated_id", armature)
+        # without an action, the menu is an icon alone
+        row.template_action(armature, unlink="action.unlink", text="" if action else "Action")
     if action is None:
         return
     start, end = action.frame_range

@@ -154,7 +154,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
     )
     idle_minutes: bpy.props.IntProperty(
-        name="Release Memory After",
+        name="Release Memory After (min)",
         description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
         "0: never",
         default=10,

@@ -19,7 +19,7 @@ from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_
 from ..scene.human import human_of, humans
 from ..scene.representation import in_viewport, representation_of
 from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
-from .preferences import known
+from .preferences import draw_set_up, known
 
 _FROM_EEVEE = frozenset(
     {
@@ -51,6 +51,7 @@ class PRIMDIFFUSION_PT_marching(_OfEngine, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_render
+        draw_set_up(layout)
         layout.prop(settings, "view")
         layout.prop(settings, "step")
         layout.prop(settings, "solids")
@@ -229,5 +230,7 @@ class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         draw_engines(self.layout, context.scene)
+        if context.scene.render.engine == ENGINE:
+            draw_set_up(self.layout)
         draw_job_state(self.layout, "merge")
         self.layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")

@@ -26,9 +26,7 @@ from .drawing import draw_lines
 LOCKS = Path(__file__).resolve().parents[1] / "requirements"
 OWN_LOCK = "requirements.txt"
 """In a folder of wheels: a list of packages that goes before ours."""
-_ONLINE = (
-    "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
-)
+_ONLINE = "Blender may not use the network: allow it, or install from a folder"
 
 
 session = Session(
@@ -107,6 +105,7 @@ def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:
         draw_lines(layout, note, "INFO", width)
     if not bpy.app.online_access:
         draw_lines(layout, _ONLINE, "INTERNET_OFFLINE", width)
+        layout.operator("extensions.userpref_allow_online", text="Allow Online Access", icon="CHECKMARK")
     return True
 
 
@@ -115,7 +114,9 @@ def draw_button(layout: bpy.types.UILayout, width: int, *, broken: bool) -> bool
     possible = draw_cost(layout, width)
     if possible:
         text, icon = ("Repair", "TOOL_SETTINGS") if broken else ("Set Up Backend", "IMPORT")
-        layout.operator("primdiffusion.set_up_backend", text=text, icon=icon).repair = broken
+        row = layout.row()
+        row.enabled = bpy.app.online_access
+        row.operator("primdiffusion.set_up_backend", text=text, icon=icon).repair = broken
     return possible
 
 
@@ -125,10 +126,12 @@ def draw_private(layout: bpy.types.UILayout, width: int, *, there: bool) -> None
     possible = draw_cost(layout, width)
     row = layout.row()
     row.enabled = possible
-    row.operator("primdiffusion.set_up_backend", icon="IMPORT")
-    row.operator("primdiffusion.set_up_backend", text="Install from Folder", icon="FILE_FOLDER").choose = True
+    online = row.row()
+    online.enabled = bpy.app.online_access
+    online.operator("primdiffusion.set_up_backend", icon="IMPORT")
     if there:
-        row.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
+        online.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
+    row.operator("primdiffusion.set_up_backend", text="Install from Folder", icon="FILE_FOLDER").choose = True
 
 
 def draw_result(layout: bpy.types.UILayout, width: int) -> None:

@@ -20,7 +20,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -134,8 +133,10 @@ def differing(one: Path, other: Path, left: int, top: int, right: int, bottom: i
 def main() -> int:
     options = arguments()
     options.out.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".window_", dir=ROOT / "build" if (ROOT / "build").is_dir() else ROOT))
     display = free_display()
+    scratch = ROOT / "build" / f"window_{display}"  # the same in each run, for numba to find its kernels again
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
     screen = subprocess.Popen(
         ["Xvfb", f":{display}", "-screen", "0", f"{options.size}x24", "-ac"], stderr=subprocess.DEVNULL
     )
@@ -148,6 +149,7 @@ def main() -> int:
             "DISPLAY": f":{display}",
             "LIBGL_ALWAYS_SOFTWARE": "1",
             "BLENDER_USER_RESOURCES": str(scratch / "user"),
+            "PRIMDIFFUSION_CACHE": str(ROOT / "build" / "window_cache"),
         }
         environment.pop("PRIMDIFFUSION_PYTHON", None)
         program = [] if options.chroot is None else ["chroot", str(options.chroot)]

@@ -18,7 +18,7 @@ _first_view: dict[str, object] = {}
 
 
 def begin(module: str, python: str) -> Steps:
-    """As Blender starts: a cube, a light and a camera."""
+    """As Blender starts: a cube, a light and a camera; without a backend where `python` is empty."""
     around = view()[1].spaces.active.region_3d
     if not _first_view:
         _first_view.update({name: copy.copy(getattr(around, name)) for name in _VIEW})
@@ -28,8 +28,7 @@ def begin(module: str, python: str) -> Steps:
         setattr(around, name, value)
     queue_of(module).outcomes.clear()
     yield 1.5
-    if python:
-        bpy.context.preferences.addons[module].preferences.backend_python = python
+    bpy.context.preferences.addons[module].preferences.backend_python = python
 
 
 def with_people(module: str, python: str, *seeds: int) -> Steps:

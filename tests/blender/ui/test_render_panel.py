@@ -242,3 +242,12 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
         assert 0 < y < 1
         assert depth > 0
     assert any(light.type == "SUN" for light in bpy.data.lights)
+
+
+def test_our_engine_leads_to_the_set_up_where_no_backend_would_render(person, monkeypatch):
+    monkeypatch.setattr(preferences, "known", lambda: preferences.Known("absent", "The backend is not set up yet"))
+    bpy.context.scene.render.engine = "PRIMDIFFUSION"
+    for panel in (render_panel.PRIMDIFFUSION_PT_render, render_panel.PRIMDIFFUSION_PT_marching):
+        assert "The backend is not set up yet" in shown(panel, bpy.context)
+    bpy.context.scene.render.engine = "CYCLES"
+    assert "not set up" not in shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context)

@@ -101,7 +101,8 @@ def test_without_online_access_set_up_is_rejected_with_the_remedy(wheels):
         press.set_up_backend()
     layout = Layout()
     preferences.draw_set_up(layout)
-    assert "Allow Online Access" in said(layout)
+    assert "may not use the network" in said(layout)
+    assert "extensions.userpref_allow_online" in layout.of("button")
     assert not places.set_up_folder().root.exists()
 
 
@@ -112,6 +113,7 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
     preferences.draw_set_up(layout)
     assert "cannot be reached" in said(layout)
     assert "Half installed" in said(layout)
+    assert "extensions.userpref_allow_online" not in layout.of("button")
     assert "wm.path_open" in draw_preferences().of("button")
 
 
