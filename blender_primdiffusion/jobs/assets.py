@@ -12,10 +12,9 @@ import numpy as np
 from ..formats.answers import RenderAnswer
 from ..formats.joints import JOINT_NAMES
 from ..scene.blend_values import as_shown
-from ..scene.human import provenance_of
+from ..scene.human import HumanTarget, provenance_of
 from ..scene.payload import session_file
 from .queue import Job
-from .target import HumanTarget
 
 _PICTURE, _SIDE = "asset.png", 256
 _ARMS_DOWN = 1.15

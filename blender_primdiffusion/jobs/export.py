@@ -20,8 +20,7 @@ from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
 from ..motion.posture import rest_joints
 from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
-from ..scene.export_model import FrameRange, scene_with_only, write_model
-from ..scene.human import link_part, proxy_of
+from ..scene.human import HumanTarget, link_part, proxy_of
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -35,13 +34,20 @@ from ..scene.human_file import (
 )
 from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
-from ..scene.proxy import build_proxy, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.proxy import (
+    FrameRange,
+    build_proxy,
+    read_proxy,
+    remove_proxy,
+    scene_with_only,
+    show_textures_in_solid,
+    write_model,
+)
 from ..scene.representation import MESH_IN_VIEWPORT, set_representation
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
-from .target import HumanTarget
 
 
 @dataclasses.dataclass(frozen=True)

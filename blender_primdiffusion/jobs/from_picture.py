@@ -23,13 +23,12 @@ from ..motion.posture import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import check_no_handles
-from ..scene.human import humans
+from ..scene.human import HumanTarget, humans
 from ..scene.payload import BODY
 from ..scene.representation import parts_by_representation
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
-from .target import HumanTarget
 
 POSTURE_FORMAT = "primdiffusion-posture"
 """As `reconstruction/posture_start.py` of the backend writes it."""

@@ -13,10 +13,10 @@ from ..engine.picture import pose_of
 from ..files.regular_files import remove_file
 from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
+from ..scene.human import HumanTarget
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from ..scene.representation import set_representation
 from .queue import Job
-from .target import HumanTarget
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,8 +15,8 @@ from ..backend.requests import sentence
 from ..files.regular_files import remove_folder
 from ..formats.answers import VariationFiles, VariationsAnswer
 from ..scene.payload import BODY_FILE, PERSON_FILE
-from .pictures import icons
 from .queue import Job, chosen_checkpoint
+from .windows import icons
 
 NAMES = {"person": PERSON_FILE, "picture": "picture.png"}
 """Files of a human, by their names in the child's result."""

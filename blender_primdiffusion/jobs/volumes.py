@@ -13,13 +13,11 @@ from bpy.app.handlers import persistent
 
 from ..engine.engine import ENGINE
 from ..files.regular_files import printable
-from ..scene.human import all_humans
+from ..scene.human import HumanTarget, all_humans
 from ..scene.payload import session_file
 from ..scene.representation import show_in_viewport
-from ..scene.volume_files import open_humans, write_volumes, writing
-from ..scene.volume_nodes import set_folder, volumes_of
+from ..scene.volume_nodes import open_humans, set_folder, volumes_of, write_volumes, writing
 from .queue import Job
-from .target import HumanTarget
 
 SLICE_S = 0.08
 """Longest writing between two of Blender's own events, seconds."""

@@ -16,7 +16,7 @@ from mathutils import Matrix, Quaternion, Vector
 
 from .actions import action_curves, frames_in_use, loops, own_curves, repeat
 from .armature import CONTROLS, LIMBS, POLE_M, Limb, editing_bones, place_controls, rest_rotations
-from .export_model import scene_with_only
+from .proxy import scene_with_only
 
 COLLECTION = "IK Handles"
 """Of bones: handles and poles."""

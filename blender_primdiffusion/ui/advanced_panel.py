@@ -8,12 +8,11 @@ from ..backend.requests import sentence
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
 from ..jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
-from ..jobs.target import HumanTarget, selected_person
 from ..jobs.volumes import VolumesJob
 from ..places import backend_is_named
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_of, overlap_warning_in
-from ..scene.human import humans, provenance_of, proxy_of
+from ..scene.human import HumanTarget, humans, provenance_of, proxy_of, selected_person
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import remove_proxy
 from ..scene.representation import (

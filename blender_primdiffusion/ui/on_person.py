@@ -7,8 +7,7 @@ import bpy
 from ..formats.joints import JOINT_NAMES
 from ..jobs.follow import Reporting
 from ..jobs.parts import complete
-from ..jobs.target import named_person, selected_person
-from ..scene.human import human_of, humans
+from ..scene.human import human_of, humans, named_person, selected_person
 from .declared import SKIP
 
 

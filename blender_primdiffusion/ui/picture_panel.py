@@ -11,9 +11,8 @@ from ..capture.cameras import add_picture_camera, picture_of
 from ..jobs.follow import Reporting, submit
 from ..jobs.from_picture import FitPictureJob, PictureJob, PictureTask
 from ..jobs.parts import complete
-from ..jobs.target import HumanTarget, named_person
 from ..scene.blend_values import setting_path
-from ..scene.human import human_of
+from ..scene.human import HumanTarget, human_of, named_person
 from .declared import SKIP
 from .drawing import BackendPanel, draw_job, property_columns
 

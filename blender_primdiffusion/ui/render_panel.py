@@ -13,10 +13,9 @@ from ..engine.engine import ENGINE
 from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
 from ..jobs.merge import MergeJob, PoseSnapshot
-from ..jobs.target import HumanTarget
 from ..places import backend_is_named
 from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera, posed_extent
-from ..scene.human import human_of, humans
+from ..scene.human import HumanTarget, human_of, humans
 from ..scene.representation import in_viewport, representation_of
 from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
 from .preferences import known

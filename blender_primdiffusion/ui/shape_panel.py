@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..files.regular_files import printable
-from ..jobs.target import selected_person
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.edit import check_shapeable, reshape
-from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human
+from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human, selected_person
 from ..scene.rest_human import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP

@@ -12,9 +12,9 @@ from bpy.app.handlers import persistent
 from ..backend.requests import sentence
 from ..formats.requests import VariationsRequest
 from ..jobs.follow import Reporting, redraw, submit
-from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
+from ..jobs.windows import icons
 from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.place import stand_at_cursor

@@ -31,7 +31,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD
-from blender_primdiffusion.scene.volume_files import open_humans, write_volumes
+from blender_primdiffusion.scene.volume_nodes import open_humans, write_volumes
 from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 

@@ -20,8 +20,7 @@ from jobs_driven import drive
 from scene_state import state
 from shown_words import ways
 
-from blender_primdiffusion.jobs.edit import EditJob
-from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.generate import EditJob, GenerateJob
 from blender_primdiffusion.jobs.parts import complete
 from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
@@ -209,7 +208,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """Nothing is downloaded or installed."""
-    from blender_primdiffusion.jobs.steps import Session
+    from blender_primdiffusion.jobs.follow import Session
 
     def start(session: Session, _steps: object) -> None:
         session.notice = "as if it were done"

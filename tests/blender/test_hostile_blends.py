@@ -20,7 +20,7 @@ from blender_primdiffusion.places import EXTENSION, preference
 from blender_primdiffusion.scene import payload
 from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_folder
-from blender_primdiffusion.scene.volume_files import are_written
+from blender_primdiffusion.scene.volume_nodes import are_written
 from blender_primdiffusion.ui.preferences import known
 
 

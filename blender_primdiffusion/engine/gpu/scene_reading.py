@@ -16,8 +16,7 @@ from ...scene.human_file import FileVersion, file_version, read_payload
 from ...scene.splats import SPLATS_MARK
 from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of
-from ..picture import PosedHuman, human_armatures, pose_of
-from ..solids import visible_instances
+from ..picture import PosedHuman, human_armatures, pose_of, visible_instances
 from ..who_draws import Drawer, who_draws
 from .march import GpuPayload
 from .shaders import cache_until_exit

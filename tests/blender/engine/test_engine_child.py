@@ -22,8 +22,8 @@ from support.fake_child import FAKE_CHILD
 import blender_primdiffusion
 from blender_primdiffusion.backend.environment import BackendPython
 from blender_primdiffusion.engine import drawing_child
+from blender_primdiffusion.engine.drawing_child import CHANNELS, SharedFrames, frames
 from blender_primdiffusion.engine.engine import render_layer
-from blender_primdiffusion.engine.shared_frames import CHANNELS, SharedFrames, frames
 
 pytestmark = pytest.mark.any_blender
 
@@ -249,13 +249,12 @@ def test_unregistering_ends_the_child_removes_the_frames_and_leaves_the_scene_a_
         blender_primdiffusion.register()
 
 
-def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage, monkeypatch):
-    monkeypatch.setattr(drawing_child, "IDLE_S", 0.3)
+def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage):
     render()
     pid = drawing_child.child_pid()
     end = time.monotonic() + 300
     while drawing_child.child_pid() is not None and time.monotonic() < end:
-        drawing_child.end_when_idle()  # a timer does
+        drawing_child.end_when_idle(0.3)  # a timer does
         time.sleep(0.05)
     assert drawing_child.child_pid() is None
     assert render() == {"FINISHED"}
@@ -271,7 +270,7 @@ from backend_python import use_this_python
 use_this_python(pytest.MonkeyPatch(), Path(sys.argv[1]))
 b.register()
 from blender_primdiffusion.engine import drawing_child
-from blender_primdiffusion.engine.shared_frames import frames
+from blender_primdiffusion.engine.drawing_child import frames
 frame = frames.take(8, 8)
 request = drawing_child.draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
 while request.step == 0:

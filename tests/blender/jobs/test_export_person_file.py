@@ -11,7 +11,6 @@ import synthetic_shape
 from human_files import forget_session_files, person_file
 
 from blender_primdiffusion.jobs.assets import HumanAssetJob
-from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.export import (
     AddProxyJob,
     ExportGaussiansJob,
@@ -19,11 +18,12 @@ from blender_primdiffusion.jobs.export import (
     ExportVdbSequenceJob,
     posed_frames,
 )
+from blender_primdiffusion.jobs.generate import EditJob
 from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import Job
-from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.export_model import FrameRange
+from blender_primdiffusion.scene.human import HumanTarget
+from blender_primdiffusion.scene.proxy import FrameRange
 
 
 @pytest.fixture

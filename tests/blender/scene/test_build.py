@@ -21,7 +21,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
-from blender_primdiffusion.scene.volume_files import open_humans
+from blender_primdiffusion.scene.volume_nodes import open_humans
 
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions", "images", "node_groups")
 

@@ -15,10 +15,9 @@ from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import MARK, humans
+from blender_primdiffusion.scene.human import MARK, HumanTarget, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.scene.representation import representation_of, show_in_viewport
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE

@@ -11,9 +11,8 @@ from blender_primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.export_model import FrameRange, write_model
 from blender_primdiffusion.scene.handles import add_handles
-from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy
+from blender_primdiffusion.scene.proxy import FrameRange, build_proxy, read_proxy, remove_proxy, write_model
 
 EXACT = 1e-4
 """Metres."""
