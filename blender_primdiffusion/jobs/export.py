@@ -16,9 +16,8 @@ from ..engine.picture import pose_of
 from ..files.regular_files import exists_in_its_folder, remove_file
 from ..files.whole_files import written_whole
 from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
-from ..formats.poses.rotation import nearest
-from ..formats.poses.skeleton import unchain
-from ..motion.posture import rest_joints
+from ..motion.placing import sample_motion
+from ..scene.actions import posed_on
 from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
 from ..scene.human import HumanTarget, link_part, proxy_of
 from ..scene.human_file import (
@@ -35,11 +34,9 @@ from ..scene.human_file import (
 from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
 from ..scene.proxy import (
-    FrameRange,
     build_proxy,
     read_proxy,
     remove_proxy,
-    scene_with_only,
     show_textures_in_solid,
     write_model,
 )
@@ -84,7 +81,8 @@ class ExportMeshJob(ProxyJob):
 
     path: Path
     format: str
-    frames: FrameRange
+    frames: range
+    """One is a pose."""
 
     @property
     def label(self) -> str:
@@ -99,7 +97,7 @@ class ExportMeshJob(ProxyJob):
         finally:
             remove_proxy(proxy)
         size = self.path.stat().st_size / 1e6
-        frames = f", {self.frames.last - self.frames.first + 1} frames" if self.frames.animated else ""
+        frames = f", {len(self.frames)} frames" if len(self.frames) > 1 else ""
         return f"Exported {person.name} to {self.path.name}: {result.triangles} triangles{frames}, {size:.1f} MB"
 
 
@@ -126,11 +124,11 @@ class AddProxyJob(ProxyJob):
         return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
 
 
-def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
+def scene_frames(scene: bpy.types.Scene, animated: bool) -> range:
     """The scene's range, or the current frame."""
     if animated:
-        return FrameRange(scene.frame_start, scene.frame_end)
-    return FrameRange(scene.frame_current, scene.frame_current)
+        return range(scene.frame_start, scene.frame_end + 1)
+    return range(scene.frame_current, scene.frame_current + 1)
 
 
 def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: Iterable[int]) -> list[dict[str, Any]]:
@@ -139,21 +137,15 @@ def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: I
     Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
     """
     check_joints(person)
-    found = []
-    with scene_with_only(context, person) as scene:
-        for frame in frames:
-            if frame != scene.frame_current:
-                scene.frame_set(frame)
-            evaluated = person.evaluated_get(scene.view_layers[0].depsgraph)
-            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64)).params())
-    return found
+    shown = posed_on(context, person, frames)
+    return [pose_of(one, np.array(one.matrix_world, np.float64)).params() for one in shown]
 
 
 def write_human(
     context: bpy.types.Context,
     person: bpy.types.Object,
     path: Path,
-    frames: FrameRange | None,
+    frames: range | None,
     *,
     compact: bool = False,
 ) -> None:
@@ -168,23 +160,11 @@ def write_human(
     if has_custom_shape(person):
         betas = betas_of(person)
         human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
-    motion = None if frames is None else _motion(context, person, frames)
+    motion = None
+    if frames is not None:
+        moved, _, _ = sample_motion(context, person, frames)
+        motion = HumanMotion(np.array(frames), moved.rotations, moved.translations, moved.fps)
     write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
-
-
-def _motion(context: bpy.types.Context, person: bpy.types.Object, frames: FrameRange) -> HumanMotion:
-    numbers = range(frames.first, frames.last + 1)
-    joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
-    pelvis = rest_joints(person)[0]
-    rotations = nearest(joints[..., :3])  # bones may be scaled and mirrored
-    translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
-    render = context.scene.render
-    return HumanMotion(
-        np.array(numbers, np.float32),
-        unchain(rotations).astype(np.float32),
-        translations.astype(np.float32),
-        render.fps / render.fps_base,
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..files.regular_files import remove_file
-from ..formats.answers import MergeAnswer, MergeFramesAnswer
-from ..formats.joints import JOINT_NAMES
+from ..formats.answers import MergeFramesAnswer
+from ..scene.armature import check_joints
 from ..scene.human import HumanTarget
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from ..scene.representation import set_representation
@@ -35,64 +35,38 @@ class PoseSnapshot:
         Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the human's file is
         missing.
         """
+        check_joints(person)
         armature = person if armature is None else armature
-        missing = [name for name in JOINT_NAMES if name not in armature.pose.bones]
-        if missing:
-            raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again")
         pose = pose_of(armature, np.eye(4))
         return cls(pose.params(), pose_digest(person, pose.joints, pose.betas))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class MergeJob(Job):
-    """Merge a human in one pose into one volume."""
+    """Merge a human into one volume, or one for each frame."""
 
-    kind = method = "merge"
+    method = "merge_frames"
     undo = "Merge Human"
 
     target: HumanTarget
-    moment: PoseSnapshot
-    voxel: float
-    """Metres."""
-
-    @property
-    def label(self) -> str:
-        return f"Merge {self.target.name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        people = [{**self.moment.params, "human": self.target.file_now()}]
-        return {"people": people, "voxel": self.voxel, "out": str(folder / "grid.npz")}
-
-    def finish(self, _context: bpy.types.Context, result: MergeAnswer, folder: Path) -> str:
-        person = self.target.found()
-        digest = write_grid(read_grid(result.out), folder / "grid.vdb")
-        files = publish([folder / "grid.vdb"], [digest], merged_folder())
-        show_merged(person, files, MergedState((self.moment.digest,), self.voxel))
-        set_representation(person, "MERGED")
-        size = files[0].stat().st_size / 1e6
-        return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result.seconds:.1f} s, {size:.1f} MB"
-
-
-@dataclasses.dataclass
-class MergeFramesJob(Job):
-    """Merge a human into one volume for each frame."""
-
-    kind = method = "merge_frames"
-    undo = "Merge Frames"
-
-    target: HumanTarget
     moments: list[PoseSnapshot]
-    start: int
-    """The first frame's number."""
+    """One for a volume, else one for each frame."""
     voxel: float
     """Metres."""
+    start: int = 0
+    """The first frame's number, of several."""
     _digests: list[str] = dataclasses.field(default_factory=list, init=False, repr=False)
     """Digests of the VDB files written so far."""
     _error: OSError | ValueError | None = dataclasses.field(default=None, init=False, repr=False)
 
     @property
+    def kind(self) -> str:
+        return "merge" if len(self.moments) == 1 else "merge_frames"
+
+    @property
     def label(self) -> str:
-        return f"Merge {self.target.name}, {len(self.moments)} frames"
+        frames = f", {len(self.moments)} frames" if len(self.moments) > 1 else ""
+        return f"Merge {self.target.name}{frames}"
 
     def params(self, folder: Path) -> dict[str, Any]:
         """The grids become VDB files as they appear: see `advance`."""
@@ -124,7 +98,8 @@ class MergeFramesJob(Job):
         show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
         set_representation(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6
-        return f"Merged {len(files)} frames of {person.name} in {result.seconds:.1f} s, {size:.0f} MB"
+        what = f"{len(files)} frames of {person.name}" if len(files) > 1 else person.name
+        return f"Merged {what} at {self.voxel * 1e3:.3g} mm in {result.seconds:.1f} s, {size:.1f} MB"
 
 
 def _grid(folder: Path, index: int) -> Path:

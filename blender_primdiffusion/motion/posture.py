@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import from_axis_angle, to_axis_angle
-from ..scene.armature import model_origin, pose_from_joint_rotations, rest_rotations
+from ..scene.armature import check_joints, model_origin, pose_from_joint_rotations, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend, points_to_blender
 
 _UNSCALED = 1e-3
@@ -17,8 +17,8 @@ _UNSCALED = 1e-3
 
 def rest_joints(armature: bpy.types.Object) -> NDArray[np.float64]:
     """SMPL's joints at rest [24, 3] in the body model's space, y up, in the armature's units. Raises ValueError as
-    `rest_rotations`."""
-    rest_rotations(armature)
+    `check_joints`."""
+    check_joints(armature)
     heads = np.array([armature.data.bones[name].head_local for name in JOINT_NAMES], np.float64)
     return points_to_backend(heads - model_origin(armature.data))
 
@@ -29,9 +29,7 @@ def check_posable(armature: bpy.types.Object) -> None:
         raise ValueError(
             f"{armature.name!r} is linked from another file: make a library override of it (Object > Library Override)"
         )
-    if armature.mode == "EDIT":
-        raise ValueError(f"{armature.name!r} is in Edit Mode: leave it (Tab) first")
-    rest_rotations(armature)
+    check_joints(armature)
 
 
 def current_pose(armature: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

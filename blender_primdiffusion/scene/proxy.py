@@ -25,6 +25,7 @@ from ..files.arrays import all_finite, check_shapes, read_arrays
 from ..files.regular_files import FileError, as_file_error, portable_name, remove_folder
 from ..files.whole_files import replacing
 from ..formats.joints import JOINT_NAMES
+from .actions import scene_with_only
 from .armature import check_joints, model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh
@@ -133,28 +134,15 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
     return material
 
 
-@dataclasses.dataclass(frozen=True)
-class FrameRange:
-    """The frames that are exported."""
-
-    first: int
-    last: int
-
-    @property
-    def animated(self) -> bool:
-        """Whether this is more than one pose."""
-        return self.last > self.first
-
-
 def write_model(
     context: bpy.types.Context,
     armature: bpy.types.Object,
     mesh: bpy.types.Object,
     path: Path,
     kind: str,
-    frames: FrameRange,
+    frames: range,
 ) -> None:
-    """Write a file of `kind` (GLB, FBX or USD), which appears whole or not at all.
+    """Write a file of `kind` (GLB, FBX or USD), which appears whole or not at all; one frame is a pose.
 
     USD's textures go into a folder beside the file, except in .usdz. Raises ValueError or RuntimeError where an
     exporter is missing or fails, and OSError.
@@ -172,38 +160,16 @@ def write_model(
 
 
 @contextmanager
-def scene_with_only(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
-    """A temporary scene with only the armature, at the current frame: with volumes, evaluation takes far longer.
-
-    An armature that is hidden or shown in rest position is posed meanwhile.
-    """
-    source = context.scene
-    scene = bpy.data.scenes.new(armature.name)
-    before = armature.hide_viewport, armature.data.pose_position
-    try:
-        armature.hide_viewport, armature.data.pose_position = False, "POSE"
-        for name in ("fps", "fps_base"):
-            setattr(scene.render, name, getattr(source.render, name))
-        scene.unit_settings.scale_length = source.unit_settings.scale_length
-        scene.collection.objects.link(armature)
-        scene.frame_set(source.frame_current)
-        yield scene
-    finally:
-        armature.hide_viewport, armature.data.pose_position = before
-        bpy.data.scenes.remove(scene)
-
-
-@contextmanager
 def _selected_in_scene(
-    context: bpy.types.Context, armature: bpy.types.Object, mesh: bpy.types.Object, frames: FrameRange
+    context: bpy.types.Context, armature: bpy.types.Object, mesh: bpy.types.Object, frames: range
 ) -> Iterator[dict[str, object]]:
     """Context overrides for a temporary scene in which the armature and the mesh are selected."""
     with scene_with_only(context, armature) as scene:
-        scene.frame_start, scene.frame_end = frames.first, frames.last
+        scene.frame_start, scene.frame_end = frames[0], frames[-1]
         scene.collection.objects.link(mesh)
         layer = scene.view_layers[0]
-        if frames.animated:
-            scene.frame_set(frames.first)
+        if len(frames) > 1:
+            scene.frame_set(frames[0])
         for obj in (armature, mesh):
             obj.select_set(True, view_layer=layer)
         layer.objects.active = armature
@@ -213,7 +179,7 @@ def _selected_in_scene(
         }  # fmt: skip
 
 
-def _write_glb(path: Path, frames: FrameRange) -> None:
+def _write_glb(path: Path, frames: range) -> None:
     with _enabled("io_scene_gltf2", "glTF"):
         _run(
             bpy.ops.export_scene.gltf,
@@ -222,11 +188,11 @@ def _write_glb(path: Path, frames: FrameRange) -> None:
             use_selection=True,
             use_active_scene=True,
             export_image_format="AUTO",
-            export_animations=frames.animated,
+            export_animations=len(frames) > 1,
             export_animation_mode="SCENE",
             export_anim_scene_split_object=False,
             export_frame_range=True,
-            export_rest_position_armature=frames.animated,
+            export_rest_position_armature=len(frames) > 1,
             export_current_frame=True,
             export_influence_nb=4,
             export_def_bones=True,
@@ -234,7 +200,7 @@ def _write_glb(path: Path, frames: FrameRange) -> None:
         )
 
 
-def _write_fbx(path: Path, frames: FrameRange) -> None:
+def _write_fbx(path: Path, frames: range) -> None:
     with _enabled("io_scene_fbx", "FBX"):
         _run(
             bpy.ops.export_scene.fbx,
@@ -253,14 +219,14 @@ def _write_fbx(path: Path, frames: FrameRange) -> None:
         )
 
 
-def _write_usd(path: Path, frames: FrameRange) -> None:
+def _write_usd(path: Path, frames: range) -> None:
     if not bpy.app.build_options.usd:
         raise ValueError("this Blender was built without USD: choose glTF or FBX")
     _run(
         bpy.ops.wm.usd_export,
         filepath=str(path),
         selected_objects_only=True,
-        export_animation=frames.animated,
+        export_animation=len(frames) > 1,
         export_armatures=True,
         only_deform_bones=True,
         export_textures_mode="NEW",
@@ -268,7 +234,7 @@ def _write_usd(path: Path, frames: FrameRange) -> None:
     )
 
 
-_EXPORTERS: dict[str, Callable[[Path, FrameRange], None]] = {"GLB": _write_glb, "FBX": _write_fbx, "USD": _write_usd}
+_EXPORTERS: dict[str, Callable[[Path, range], None]] = {"GLB": _write_glb, "FBX": _write_fbx, "USD": _write_usd}
 
 
 @contextmanager

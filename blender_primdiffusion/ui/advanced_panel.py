@@ -7,9 +7,10 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
-from ..jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
+from ..jobs.merge import MergeJob, PoseSnapshot
 from ..jobs.volumes import VolumesJob
 from ..places import backend_is_named
+from ..scene.actions import posed_on
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_of, overlap_warning_in
 from ..scene.human import HumanTarget, humans, provenance_of, proxy_of, selected_person
@@ -116,14 +117,15 @@ class PRIMDIFFUSION_OT_merge(HumanOperator, bpy.types.Operator):
         target, voxel = HumanTarget.of(person), context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
             moment = PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get()))
-            return submit(self, context, MergeJob(target, moment, voxel))
+            return submit(self, context, MergeJob(target, [moment], voxel))
         start, end = context.scene.frame_start, context.scene.frame_end
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
                 f"frames {start} to {end} are not a sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
-        moments = _moments(context, person, range(start, end + 1))
-        return submit(self, context, MergeFramesJob(target, moments, start, voxel))
+        shown = posed_on(context, person, range(start, end + 1))
+        moments = [PoseSnapshot.capture(person, armature) for armature in shown]
+        return submit(self, context, MergeJob(target, moments, voxel, start))
 
 
 def _unmerge(person: bpy.types.Object) -> None:
@@ -132,19 +134,6 @@ def _unmerge(person: bpy.types.Object) -> None:
         raise ValueError(f"{person.name!r} has no merged volume")
     stop_showing(person, "MERGED")
     remove_merged(person)
-
-
-def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[PoseSnapshot]:
-    """The human in each frame; the scene is at its own frame again afterwards."""
-    scene, now = context.scene, context.scene.frame_current
-    moments = []
-    try:
-        for frame in frames:
-            scene.frame_set(frame)
-            moments.append(PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get())))
-    finally:
-        scene.frame_set(now)
-    return moments
 
 
 class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):

@@ -49,10 +49,6 @@ def other_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.typ
     return other
 
 
-FACTS = "primdiffusion_motion"
-"""Custom property of an action: what its motion is, as JSON."""
-
-
 def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.Object:
     """The armature of the human named, else the active armature if it has SMPL's joints, else the selected human's.
 
@@ -82,11 +78,6 @@ def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> No
         operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position")
 
 
-def scene_fps(scene: bpy.types.Scene) -> float:
-    """Frames per second, such as 23.976."""
-    return scene.render.fps / scene.render.fps_base
-
-
 class ArmatureOperator(HumanOperator):
     """Base of operators on one armature with SMPL's joints, a human's or another."""
 
@@ -102,7 +93,7 @@ class ArmatureOperator(HumanOperator):
 
 
 class WhereTo:
-    """Properties of operators that key a motion, with the values of `motion_placing.Placement`."""
+    """Properties of operators that key a motion, with the values of `motion.placing.Placement`."""
 
     start: bpy.props.IntProperty(name="Start Frame", description="Scene frame of the first pose", default=1)
     root: bpy.props.EnumProperty(

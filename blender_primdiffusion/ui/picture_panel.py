@@ -79,10 +79,11 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
 
     bl_idname = "primdiffusion.human_from_picture"
     bl_label = "Human from Picture"
+    described_by = ("only_fit",)
 
     only_fit: bpy.props.BoolProperty(
         name="Fit Only",
-        description="Refine pose and shape of the selected human, and the camera, and make no new human",
+        description="Refine pose and shape of the selected human, and the camera, until they match the picture",
         options=SKIP,
     )
     human: bpy.props.StringProperty(
@@ -90,12 +91,6 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         description="Name of the human posed over the picture; empty: the selected one, if any",
         options=SKIP,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        if properties.only_fit:
-            return "Refine pose and shape of the selected human, and the camera, until they match the picture"
-        return cls.__doc__ or ""
 
     def act(self, context: bpy.types.Context) -> set[str]:
         complete()

@@ -139,7 +139,7 @@ def _merge_all(operator: bpy.types.Operator, context: bpy.types.Context) -> set[
     """Merge the humans that volumes show: Cycles then renders them in seconds. Those that move keep their volumes."""
     graph, voxel = context.evaluated_depsgraph_get(), context.scene.primdiffusion_merging.voxel
     jobs = [
-        MergeJob(HumanTarget.of(person), PoseSnapshot.capture(person, person.evaluated_get(graph)), voxel)
+        MergeJob(HumanTarget.of(person), [PoseSnapshot.capture(person, person.evaluated_get(graph))], voxel)
         for person in humans(context.scene)
         if representation_of(person) == "VOLUMES" and not (person.animation_data and person.animation_data.action)
     ]

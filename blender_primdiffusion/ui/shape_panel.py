@@ -165,6 +165,7 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
     bl_options = {"REGISTER", "UNDO"}  # fast enough to be redone with other settings
+    described_by = ("to",)
 
     to: bpy.props.EnumProperty(name="Reshape To", description="Which shape", items=_SHAPES, options=SKIP)
     betas: bpy.props.FloatVectorProperty(
@@ -183,12 +184,6 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
         min=0.0,
         max=2.0,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        if properties.to == "GIVEN":
-            return str(cls.__doc__)
-        return next(text for name, _, text in _SHAPES if name == properties.to)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.to == "RANDOM" and not self.given("seed"):

@@ -13,7 +13,7 @@ from support.errors import refused
 
 from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
+from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
@@ -126,7 +126,7 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "takes long")
     moment = PoseSnapshot.capture(person)
     before = sorted(folder_of(person).iterdir())
-    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment, moment], 1, 0.02))
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), [moment, moment], 0.02, 1))
     until_running()
     queue.cancel()
     drive()
@@ -139,7 +139,7 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
     write_grid = merge.write_grid
     monkeypatch.setattr(merge, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
     moment = PoseSnapshot.capture(person)
-    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment] * 5, 1, 0.02))
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), [moment] * 5, 0.02, 1))
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == 5
@@ -159,7 +159,7 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
 
 
 def test_a_human_removed_meanwhile_is_not_merged(person):
-    queue.add(bpy.context, MergeJob(HumanTarget.of(person), PoseSnapshot.capture(person), 0.02))
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), [PoseSnapshot.capture(person)], 0.02))
     remove_human(person)
     drive()
     assert "was removed" in error_of("merge")
