@@ -26,8 +26,10 @@ from ..scene.human_file import (
     compacted,
     expanded,
     motion_in,
+    read_human,
     read_tensors,
     reshaped,
+    shape_model_of,
     with_motion,
     write_tensors,
 )
@@ -41,7 +43,6 @@ from ..scene.proxy import (
     write_model,
 )
 from ..scene.representation import MESH_IN_VIEWPORT, set_representation
-from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
@@ -268,29 +269,22 @@ class ImportHumanJob(Job):
 def opened(source: Path, folder: Path) -> HumanAnswer | None:
     """Write the human of a file, without a motion, into `folder`, and the file of its body where it has one.
 
-    None for files that only the backend can read: humans on a body of the user's files without a good BODY_FILE beside
-    them, and files of other kinds. Raises ValueError for a damaged human, OSError.
+    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
+    and files of other kinds. Raises ValueError for a damaged human, OSError.
     """
     began = time.monotonic()
     try:
         human = read_tensors(source)
     except ValueError:
         return None
-    if "body" in human.metadata and not _has_body(source):
+    body = source.with_name(BODY_FILE) if "body" in human.metadata else None
+    if body is not None and not exists_in_its_folder(body):
         return None
     read_human(source, CHOOSE_ANOTHER)
     write_tensors(folder / PERSON_FILE, with_motion(human, None))
-    if "body" in human.metadata:
-        shutil.copyfile(source.with_name(BODY_FILE), folder / BODY_FILE)
+    if body is not None:
+        shutil.copyfile(body, folder / BODY_FILE)
     return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
-
-
-def _has_body(person: Path) -> bool:
-    """Whether a good BODY_FILE is beside a human's file."""
-    try:
-        return exists_in_its_folder(person.with_name(BODY_FILE)) and bool(body_of_file(person))
-    except (ValueError, OSError):
-        return False
 
 
 def name_of(path: str) -> str:

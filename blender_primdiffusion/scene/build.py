@@ -15,9 +15,9 @@ from ..formats.joints import JOINT_NAMES
 from .armature import build_armature, floor_below
 from .convention import points_to_blender
 from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part
+from .human_file import read_human, shape_model_of
 from .payload import pack
 from .representation import set_representation
-from .rest_human import read_human, shape_model_of
 from .shape import betas_of
 from .splats import SPLATS_AVAILABLE
 from .stand_in import build_stand_in

@@ -14,7 +14,7 @@ from ..files.regular_files import printable
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.edit import check_shapeable, reshape
 from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human, selected_person
-from ..scene.rest_human import shape_model_of
+from ..scene.human_file import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
 from .drawing import draw_lines, draw_section, property_columns

@@ -11,7 +11,7 @@ import synthetic_shape
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import overlap_of, overlap_warning
 from blender_primdiffusion.scene.human import MARK
-from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene.human_file import read_human
 from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volumes import max_overlap
 from blender_primdiffusion.ui.advanced_panel import details
