@@ -16,7 +16,6 @@ from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
 from ..formats.requests import ReconstructRequest
 from ..scene.build import build_human
-from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, replace_person, select_human
 from ..scene.human import HumanTarget, humans
 from ..scene.payload import session_file
@@ -44,11 +43,8 @@ def build_person(
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, person)
         bring_into_view(person, 0.0 if len(humans(context.scene)) > 1 else FIRST_HUMAN_SHARE)
-    warnings = list(result.warnings)
-    if overlap := overlap_warning_in(context.scene, person):
-        warnings.append(overlap)
     notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
-    return person, " ".join([sentence(notice), *map(sentence, warnings)])
+    return person, " ".join([sentence(notice), *map(sentence, result.warnings)])
 
 
 def bring_into_view(obj: bpy.types.Object, least: float) -> None:
@@ -203,5 +199,5 @@ class EditJob(Job):
         done = show_in_place(context, person, result)
         shape = "; the body's shape has changed too" if done.reshaped else ""
         message = f"{self.made} {person.name} in {result.seconds:.1f} s"
-        warnings = (*result.warnings, done.warning, overlap_warning_in(context.scene, person))
+        warnings = (*result.warnings, done.warning)
         return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])

@@ -1,4 +1,4 @@
-"""Cycles: settings by which a thousand volumes take minutes, a camera, and the limit on overlapping volumes."""
+"""Cycles: settings by which a thousand volumes take minutes, and a camera."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from .human import MARK, humans, provenance_of
-from .representation import representation_of
+from .human import humans
+from .place import posed_extent
 
 _FOCAL_MM, _SENSOR_MM = 70.0, 36.0
 _MARGIN = 1.05
-_FLESH_M = 0.08
 
 
 def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
@@ -36,15 +35,6 @@ def humans_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[
     if not extents:
         raise ValueError(f"there is no human in the scene {scene.name!r}; add one first")
     return np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
-
-
-def posed_extent(person: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest corner [3] in the world of a human's bones as posed, with a margin for flesh."""
-    bpy.context.view_layer.update()
-    bones = [bone for bone in person.pose.bones if bone.bone.use_deform]
-    ends = [person.matrix_world @ end for bone in bones for end in (bone.head, bone.tail)]
-    points = np.array(ends, np.float64)
-    return points.min(0) - _FLESH_M, points.max(0) + _FLESH_M
 
 
 def new_camera(scene: bpy.types.Scene) -> bpy.types.Object:
@@ -70,38 +60,3 @@ def frame_box(
     camera.location = (low + high) / 2 + direction * distance
     camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
     camera.data.clip_end = max(100.0, 2 * distance)
-
-
-CYCLES_LIMIT = 31
-"""Volumes that Cycles evaluates at a point."""
-
-
-def overlap_warning(person: bpy.types.Object) -> str | None:
-    """A sentence for the user where Cycles will drop volumes of this human, as it was made; else None."""
-    try:
-        most = overlap_of(person)
-    except ValueError:  # changed by hand
-        return None
-    if most <= CYCLES_LIMIT:
-        return None
-    return (
-        f"Cycles leaves out parts of {person.name!r}, where {most} volumes overlap and it draws only "
-        f"{CYCLES_LIMIT}; render with the PrimDiffusion engine"
-    )
-
-
-def overlap_warning_in(scene: bpy.types.Scene, person: bpy.types.Object) -> str | None:
-    """`overlap_warning` for a human shown by volumes where Cycles is the scene's engine: no other engine drops any."""
-    by_volumes = scene.render.engine == "CYCLES" and representation_of(person) == "VOLUMES"
-    return overlap_warning(person) if by_volumes else None
-
-
-def overlap_of(person: bpy.types.Object) -> int:
-    """The largest number of volumes at a point, at rest, as counted when the human was made.
-
-    Raises ValueError where the human's provenance was changed by hand.
-    """
-    stored = provenance_of(person).get("most_overlapping")
-    if not isinstance(stored, int):
-        raise ValueError(f"the custom property {MARK!r} of {person.name!r} was changed by hand")
-    return stored

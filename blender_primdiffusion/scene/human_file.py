@@ -38,7 +38,7 @@ from ..formats.poses.rotation import first_improper, improper_text
 from .human import BETA_COUNT, LARGEST_BETA
 from .payload import BODY_FILE, LARGEST_PERSON, session_file
 from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
-from .volumes import Grids, bake, max_overlap
+from .volumes import Grids, bake
 
 _METADATA = "__metadata__"
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
@@ -344,11 +344,7 @@ class RestHuman:
 
     def provenance(self) -> str:
         """JSON for the custom property `human.MARK`."""
-        offset, half = self.grids().drawn_box()
-        centre = self.rest.position + np.einsum("kij,kj->ki", self.rest.rotation, offset)
-        betas = np.round(self.payload.betas.astype(np.float64), 6).tolist()
-        most = max_overlap(centre, self.rest.rotation, half)
-        return json.dumps({**self.made, "betas": betas, "most_overlapping": most})
+        return json.dumps({**self.made, "betas": np.round(self.payload.betas.astype(np.float64), 6).tolist()})
 
 
 def read_human(person: Path, remedy: str = GENERATE_AGAIN) -> RestHuman:

@@ -30,8 +30,8 @@ def stand_at_cursor(context: bpy.types.Context, person: bpy.types.Object) -> Non
     the world's x axis past other humans. Evaluates the scene."""
     person.location += context.scene.cursor.location
     context.view_layer.update()
-    extent = _extent(person)
-    people = [_extent(other) for other in humans(context.scene) if other != person and other.data.bones]
+    extent = posed_extent(person)
+    people = [posed_extent(other) for other in humans(context.scene) if other != person and other.data.bones]
     solids = list(_solids(context.evaluated_depsgraph_get(), extent))
     away = _nearest(_ways_out(extent, solids), extent, solids)
     moved = extent + away
@@ -69,8 +69,8 @@ def _too_close(extent: NDArray, other: NDArray) -> bool:
     return bool((apart < 0).all() or ((apart < GAP_M - 1e-6).all() and (apart < 0).any()))
 
 
-def _extent(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Lowest and highest x, y and z in the world [2, 3] of the bones as posed, with a margin for flesh."""
+def posed_extent(armature: bpy.types.Object) -> NDArray[np.float64]:
+    """Lowest and highest corner [2, 3] in the world of a human's bones as posed, with a margin for flesh."""
     to_world = np.array(armature.matrix_world)
     bones = [(bone.head, bone.tail) for bone in armature.pose.bones if bone.bone.use_deform]
     ends = np.array(bones, np.float64).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]

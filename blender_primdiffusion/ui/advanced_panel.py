@@ -12,7 +12,6 @@ from ..jobs.volumes import VolumesJob
 from ..places import backend_is_named
 from ..scene.actions import posed_on
 from ..scene.blend_values import as_shown
-from ..scene.cycles import overlap_of, overlap_warning_in
 from ..scene.human import HumanTarget, humans, provenance_of, proxy_of, selected_person
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import remove_proxy
@@ -26,7 +25,7 @@ from ..scene.representation import (
     stop_showing,
 )
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
-from ..scene.volume_nodes import density_gain, volumes_of
+from ..scene.volume_nodes import density_gain
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
@@ -46,6 +45,7 @@ REPRESENTATIONS = (
 )
 _NO_MESH = ("NO_MESH", "Remove Mesh Proxy", "Delete the mesh proxy, and show what there was before")
 _MOST_FRAMES = 3_000
+_OVERLAP = "Cycles draws at most 31 volumes at a point, and humans have more in places: merge the human"
 
 
 class PRIMDIFFUSION_OT_set_representation(HumanOperator, bpy.types.Operator):
@@ -241,9 +241,8 @@ def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, pe
         draw_lines(layout, "The material PrimDiffusion Volume has no node Density Gain", "INFO")
     else:
         layout.prop(gain, "default_value", text="Density Gain")
-    warning = overlap_warning_in(context.scene, person)
-    if warning is not None:
-        draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
+    if context.scene.render.engine == "CYCLES" and representation_of(person) == "VOLUMES":
+        draw_lines(layout, _OVERLAP, "INFO")
 
 
 def _draw_facts(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
@@ -286,11 +285,6 @@ def details(person: bpy.types.Object) -> list[tuple[str, str]]:
     cloud = cloud_of(person)
     if cloud is not None:
         lines.append(("Splats", f"{len(cloud.data.points):,}"))
-    if volumes_of(person) is not None:
-        try:
-            lines.append(("Volumes", f"up to {overlap_of(person)} overlap"))
-        except ValueError:  # changed by hand
-            lines.append(("Volumes", "?"))
     return lines
 
 

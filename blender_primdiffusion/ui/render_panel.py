@@ -14,8 +14,9 @@ from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
 from ..jobs.merge import MergeJob, PoseSnapshot
 from ..places import backend_is_named
-from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera, posed_extent
+from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera
 from ..scene.human import HumanTarget, human_of, humans
+from ..scene.place import posed_extent
 from ..scene.representation import in_viewport, representation_of
 from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
 from .preferences import known
@@ -158,6 +159,7 @@ class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene
         person = human_of(context.view_layer.objects.active)
+        context.view_layer.update()
         extent = humans_extent(scene) if person is None else posed_extent(person)
         camera = new_camera(scene)
         camera.name = camera.data.name = "Human Camera"

@@ -45,7 +45,6 @@ def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
     assert not queue.busy
     assert error_of("generate") == ""
     assert queue.info["device_name"] == "fake device"
-    assert set(queue.last.seconds) == {"work", "finish"}
 
 
 def test_what_the_human_does_not_show_is_said(addon):
