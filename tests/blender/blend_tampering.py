@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
+from blender_primdiffusion.motion.placing import FACTS
 from blender_primdiffusion.places import EXTENSION
 from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, stand_in, volume_nodes
 from blender_primdiffusion.scene.build import build_human
@@ -33,7 +34,6 @@ from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, bo
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD
 from blender_primdiffusion.scene.volume_nodes import open_humans, write_volumes
 from blender_primdiffusion.ui.drawing import DATA
-from blender_primdiffusion.ui.on_person import FACTS
 
 COUNT = 3
 """Volumes of the human."""

@@ -13,6 +13,7 @@ from blender_primdiffusion.formats.poses.motion import Detected, Motion
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, joint_positions
 
 from blender_primdiffusion.motion.placing import (
+    FACTS,
     Placement,
     place_motion,
     resample,
@@ -23,7 +24,6 @@ from blender_primdiffusion.motion.placing import (
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui.motion_panel import built_in_motion
-from blender_primdiffusion.ui.on_person import FACTS
 
 pytestmark = pytest.mark.any_blender
 

@@ -18,9 +18,8 @@ from support.fake_child import FAILS, request_of
 
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.place import GAP_M
+from blender_primdiffusion.scene.place import GAP_M, posed_extent
 from blender_primdiffusion.ui import generate_panel
 
 
