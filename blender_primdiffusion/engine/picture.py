@@ -19,8 +19,7 @@ from ..formats.joints import JOINT_NAMES
 from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import points_to_backend, transforms_to_backend
-from ..scene.human import BETA_COUNT, BETAS, is_human
-from ..scene.payload import session_file
+from ..scene.human import BETA_COUNT, BETAS, is_human, session_file
 from ..scene.place import is_solid
 
 SMALLEST_SCALE = 1e-4

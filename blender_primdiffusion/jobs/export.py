@@ -1,4 +1,4 @@
-"""Exports of humans: textured meshes, .human files, 3D Gaussians and VDB sequences; imports of .human files."""
+"""Exports of humans: textured meshes, .human files, 3D Gaussians, VDB sequences, assets; imports of .human files."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ import numpy as np
 from ..engine.picture import pose_of
 from ..files.regular_files import exists_in_its_folder, remove_file
 from ..files.whole_files import written_whole
-from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
+from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer, RenderAnswer
+from ..formats.joints import JOINT_NAMES
 from ..motion.placing import sample_motion
 from ..scene.actions import posed_on
 from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
-from ..scene.human import HumanTarget, link_part, proxy_of
+from ..scene.blend_values import as_shown
+from ..scene.human import BODY_FILE, PERSON_FILE, HumanTarget, link_part, provenance_of, proxy_of, session_file
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -34,7 +36,6 @@ from ..scene.human_file import (
     write_tensors,
 )
 from ..scene.merged import read_grid, write_grid
-from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
 from ..scene.proxy import (
     build_proxy,
     read_proxy,
@@ -308,3 +309,46 @@ def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:
     keyframe_poses(
         armature, np.asarray(motion.frames, np.float64), motion.rotations, motion.translations, armature.name
     )
+
+
+_PICTURE, _SIDE = "asset.png", 256
+_ARMS_DOWN = 1.15
+"""Radians from the T pose, so that a human fills the picture."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanAssetJob(Job):
+    """Draw a picture, then mark the human as an asset. Blender draws none of an armature."""
+
+    kind = "human_asset"
+    method = "render"
+    undo = "Mark Human as Asset"
+
+    target: HumanTarget
+
+    @property
+    def label(self) -> str:
+        return f"Picture of {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        pose = np.zeros((len(JOINT_NAMES), 3))
+        pose[JOINT_NAMES.index("left_shoulder"), 2] = -_ARMS_DOWN
+        pose[JOINT_NAMES.index("right_shoulder"), 2] = _ARMS_DOWN
+        human, out = str(session_file(self.target.found())), str(folder / _PICTURE)
+        return {"human": human, "out": out, "pose": pose.ravel().tolist(), "width": _SIDE, "height": _SIDE}
+
+    def finish(self, _context: bpy.types.Context, _result: RenderAnswer, folder: Path) -> str:
+        person = self.target.found()
+        made = provenance_of(person)
+        asked = made.get("attributes")
+        asked = asked if isinstance(asked, dict) else {}
+        seed = f"seed {as_shown(made['seed'])}" if "seed" in made else "no seed"
+        said = [f"{as_shown(name)} {as_shown(value)}" for name, value in asked.items()]
+        person.asset_mark()
+        about = person.asset_data
+        about.description = ", ".join(["Generated human", seed, *said])
+        for tag in ("human", *(as_shown(value) for value in asked.values() if isinstance(value, str))):
+            about.tags.new(tag, skip_if_exists=True)
+        with bpy.context.temp_override(id=person):
+            bpy.ops.ed.lib_id_load_custom_preview(filepath=str(folder / _PICTURE))
+        return f"{person.name} is an asset now; save the file in a folder of your asset libraries"

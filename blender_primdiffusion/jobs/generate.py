@@ -17,8 +17,7 @@ from ..formats.answers import HumanAnswer
 from ..formats.requests import ReconstructRequest
 from ..scene.build import build_human
 from ..scene.edit import Replaced, replace_person, select_human
-from ..scene.human import HumanTarget, humans
-from ..scene.payload import session_file
+from ..scene.human import HumanTarget, humans, session_file
 from ..scene.place import stand_at_cursor
 from ..scene.representation import in_viewport, representation_of
 from ..scene.volume_nodes import set_folder

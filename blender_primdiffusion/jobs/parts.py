@@ -14,11 +14,10 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..files.regular_files import printable
-from ..scene.build import build_missing_parts
+from ..scene.build import STAND_IN, build_missing_parts
 from ..scene.human import BODY_MARK, PROXY_MARK, all_humans
 from ..scene.merged import MARK as MERGED_MARK
 from ..scene.splats import CELLS_MARK, SPLATS_AVAILABLE, SPLATS_MARK, cloud_of
-from ..scene.stand_in import STAND_IN
 from ..scene.volume_nodes import VOLUMES_MARK, volumes_of
 from .windows import blocking_activity, window_of
 

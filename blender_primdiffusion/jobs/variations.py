@@ -14,7 +14,7 @@ import bpy
 from ..backend.requests import sentence
 from ..files.regular_files import remove_folder
 from ..formats.answers import VariationFiles, VariationsAnswer
-from ..scene.payload import BODY_FILE, PERSON_FILE
+from ..scene.human import BODY_FILE, PERSON_FILE
 from .queue import Job, chosen_checkpoint
 from .windows import icons
 

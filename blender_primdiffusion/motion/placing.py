@@ -20,7 +20,7 @@ from ..scene.blend_values import stored_numbers
 from ..scene.convention import BLENDER_FROM_BACKEND, continuous_quaternions, points_to_backend
 from ..scene.handles import check_no_handles
 from ..scene.human import BETA_COUNT, BETAS
-from .posture import check_posable, rest_joints
+from .poses import check_posable, rest_joints
 
 _FEET = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]
 _STANDING_SHARE = 5.0

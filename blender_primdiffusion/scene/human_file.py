@@ -35,8 +35,7 @@ from ..formats.human_layout import (
     version_fault,
 )
 from ..formats.poses.rotation import first_improper, improper_text
-from .human import BETA_COUNT, LARGEST_BETA
-from .payload import BODY_FILE, LARGEST_PERSON, session_file
+from .human import BETA_COUNT, BODY_FILE, LARGEST_BETA, LARGEST_PERSON, session_file
 from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
 from .volumes import Grids, bake
 

@@ -9,8 +9,8 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from .build import STAND_IN
 from .human import BODY_MARK, PROXY_MARK, humans
-from .stand_in import STAND_IN
 
 GAP_M = 0.2
 """Distance to other humans and to solid objects, metres."""

@@ -30,8 +30,7 @@ from .armature import check_joints, model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, PROXY_MARK
-from .payload import state_of
+from .human import BETA_COUNT, BODY_MARK, PROXY_MARK, state_of
 from .shape import betas_of
 
 _FORMAT_VERSION = 1

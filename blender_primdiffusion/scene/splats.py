@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cells import NodeGroup, add_nodes, cell_mesh, shared_group
-from .human import body_of, link_part, own_data, parts_of
+from .human import body_of, link_part, own_data, parts_of, session_file
 from .human_file import RestHuman, read_human
-from .payload import session_file
 from .shape import betas_of, generated_betas
 from .volumes import WINDOW_EXPONENT
 

@@ -16,9 +16,8 @@ import bpy
 from ..files.whole_files import remove_abandoned
 from ..formats.requests import DENSITY_GAIN
 from .cells import FIRST, PRIMITIVE, NodeGroup, add_nodes, cell_mesh, set_input, shared_group
-from .human import all_humans, body_of, link_part, parts_of, write_error
+from .human import all_humans, body_of, link_part, parts_of, session_file, write_error
 from .human_file import read_human, shape_model_of
-from .payload import session_file
 from .shape import betas_of, generated_betas
 from .volumes import write_volume
 

@@ -7,8 +7,7 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
-from ..jobs.merge import MergeJob, PoseSnapshot
-from ..jobs.volumes import VolumesJob
+from ..jobs.volumes import MergeJob, PoseSnapshot, VolumesJob
 from ..places import backend_is_named
 from ..scene.actions import posed_on
 from ..scene.blend_values import as_shown

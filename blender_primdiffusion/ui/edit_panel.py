@@ -18,8 +18,7 @@ from ..formats.requests import (
 from ..jobs.follow import Reporting, submit
 from ..jobs.generate import EditJob
 from ..scene.edit import end_painting, painted_weights, start_painting
-from ..scene.human import BODY_MARK, body_of, humans, selected_person
-from ..scene.payload import session_file
+from ..scene.human import BODY_MARK, body_of, humans, selected_person, session_file
 from .declared import SKIP, declared
 from .drawing import draw_job, draw_section
 from .generate_settings import (

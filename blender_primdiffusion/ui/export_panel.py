@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.assets import HumanAssetJob
+from ..jobs.export import HumanAssetJob
 from ..jobs.follow import submit
 from ..places import backend_is_named
 from ..scene.human import HumanTarget, humans, proxy_of, selected_person

@@ -12,7 +12,7 @@ from ..backend.environment import NOT_INSTALLED
 from ..engine.engine import ENGINE
 from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
-from ..jobs.merge import MergeJob, PoseSnapshot
+from ..jobs.volumes import MergeJob, PoseSnapshot
 from ..places import backend_is_named
 from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera
 from ..scene.human import HumanTarget, human_of, humans

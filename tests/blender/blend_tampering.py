@@ -27,11 +27,21 @@ import sidebar
 
 from blender_primdiffusion.motion.placing import FACTS
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, stand_in, volume_nodes
-from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, volume_nodes
+from blender_primdiffusion.scene.build import STAND_IN, build_human
 from blender_primdiffusion.scene.edit import replace_person
-from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
-from blender_primdiffusion.scene.payload import BODY, PAYLOAD
+from blender_primdiffusion.scene.human import (
+    BETAS,
+    BODY,
+    BODY_MARK,
+    MARK,
+    ORIGIN,
+    PAYLOAD,
+    body_of,
+    is_human,
+    link_part,
+    parts_of,
+)
 from blender_primdiffusion.scene.volume_nodes import open_humans, write_volumes
 from blender_primdiffusion.ui.drawing import DATA
 
@@ -138,7 +148,7 @@ HOLDERS: dict[str, Callable[[], Any]] = {
     volume_nodes.VOLUMES_MARK: _with(volume_nodes.VOLUMES_MARK),
     splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
     splats.CELLS_MARK: _with(splats.CELLS_MARK),
-    stand_in.STAND_IN: _with(stand_in.STAND_IN),
+    STAND_IN: _with(STAND_IN),
     FACTS: lambda: bpy.data.actions["Walk"],
 }
 """What holds each custom property."""

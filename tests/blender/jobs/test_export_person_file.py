@@ -10,17 +10,17 @@ import pytest
 import synthetic_shape
 from human_files import forget_session_files, person_file
 
-from blender_primdiffusion.jobs.assets import HumanAssetJob
 from blender_primdiffusion.jobs.export import (
     AddProxyJob,
     ExportGaussiansJob,
     ExportMeshJob,
     ExportVdbSequenceJob,
+    HumanAssetJob,
     posed_frames,
 )
 from blender_primdiffusion.jobs.generate import EditJob
-from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import Job
+from blender_primdiffusion.jobs.volumes import MergeJob, PoseSnapshot
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import HumanTarget
 

@@ -21,8 +21,7 @@ from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import body_of, humans, parts_of
-from blender_primdiffusion.scene.payload import session_folder
+from blender_primdiffusion.scene.human import body_of, humans, parts_of, session_folder
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 
 

@@ -12,7 +12,7 @@ from mathutils import Matrix, Vector
 from oracle import Z_UP
 
 from blender_primdiffusion.motion.placing import cut
-from blender_primdiffusion.motion.posture import current_pose
+from blender_primdiffusion.motion.poses import current_pose
 from blender_primdiffusion.scene.actions import action_curves, loops, repeat
 from blender_primdiffusion.scene.armature import (
     CONTROLS,

@@ -11,10 +11,10 @@ from human_files import folder_of, remove_human, sequence_files, volume_path
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 
-from blender_primdiffusion.jobs import merge
+from blender_primdiffusion.jobs import volumes
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.volumes import MergeJob, PoseSnapshot
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import HumanTarget, humans
@@ -136,8 +136,8 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
 
 def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch):
     written, ticks = [], [0]
-    write_grid = merge.write_grid
-    monkeypatch.setattr(merge, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
+    write_grid = volumes.write_grid
+    monkeypatch.setattr(volumes, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
     moment = PoseSnapshot.capture(person)
     queue.add(bpy.context, MergeJob(HumanTarget.of(person), [moment] * 5, 0.02, 1))
     while follow() is not None:
