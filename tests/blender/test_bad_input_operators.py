@@ -163,7 +163,7 @@ def backend_missing(_person) -> None:
     def nowhere(*_, **__):
         raise BackendNotFound("the preferences name the Python '/nowhere/python', which does not exist: set it up")
 
-    environment.search = nowhere
+    environment.find_python = nowhere
 
 
 def two_people(_person) -> None:
@@ -193,7 +193,7 @@ SOURCE: dict[str, Path] = {}
 def anna(addon, tmp_path, monkeypatch):
     from blender_primdiffusion.backend import environment
 
-    monkeypatch.setattr(environment, "search", environment.search)  # after `backend_missing`
+    monkeypatch.setattr(environment, "find_python", environment.find_python)  # after `backend_missing`
     SOURCE.update(file=synthetic_shape.write(tmp_path / "human", 8))
     monkeypatch.setenv("FAKE_HUMAN", str(SOURCE["file"]))
     person = build_human(addon, SOURCE["file"], "Anna")

@@ -155,9 +155,9 @@ def test_a_python_beside_the_file_is_not_run_and_the_preferences_say_why(beside,
     preferences.backend_python = named
     with refused(BackendNotFound):
         list(candidates(preference("backend_python"), None))
-    monkeypatch.undo()  # the fixture's search
+    monkeypatch.undo()  # the fixture's own find_python
     with refused(BackendNotFound):
-        list(environment.search(preference("backend_python")))
+        environment.find_python(preference("backend_python"))
     found = known()
     assert not found.usable
     assert "depends on the file that is open" in found.line
