@@ -1,5 +1,6 @@
 """The volumes of a human as one object, whose node group shows a VDB file for each primitive on the skinned body; their
-material: emission and absorption driven by the density grid, times a gain; and the files, a bake that may be deleted.
+material: emission and absorption driven by the density grid, times a gain; Cycles' settings for them; and the files, a
+bake that may be deleted.
 
 The files lie beside the human's own file in the temporary folder of this session (see `payload`). A .blend that comes
 from another session, or from a stranger, names folders of its own: `open_humans` names this session's before anything
@@ -238,3 +239,16 @@ def write_volumes(person: bpy.types.Object) -> None:
     if volumes_of(person) is not None and not are_written(person):
         for _ in writing(person):
             pass
+
+
+def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
+    """Set Cycles up so that a human takes minutes, not hours: other objects lose indirect light."""
+    cycles = scene.cycles
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.max_bounces = 0
+    cycles.volume_bounces = 0
+    cycles.transparent_max_bounces = 1024  # every box in a row costs two
+    cycles.volume_step_rate = 1.0
+    cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame

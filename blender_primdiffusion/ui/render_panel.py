@@ -14,10 +14,10 @@ from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
 from ..jobs.volumes import MergeJob, PoseSnapshot
 from ..places import backend_is_named
-from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera
 from ..scene.human import HumanTarget, human_of, humans
-from ..scene.place import posed_extent
+from ..scene.place import frame_box, humans_extent, new_camera, posed_extent
 from ..scene.representation import in_viewport, representation_of
+from ..scene.volume_nodes import fit_cycles_to_volumes
 from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
 from .preferences import known
 
