@@ -317,7 +317,7 @@ class ChildRequest:
             self._clear_leftovers()
             if self._cancel_asked_at is not None:
                 self._end("cancelled", "Cancelled")
-            elif not self.info:  # it never spoke
+            elif self._client is not None and not self._client.info:  # it never spoke
                 said = event.stderr[-1] if event.stderr else event.message
                 message = f"{self._client.python} cannot run the backend: {said}"
                 self._fail(RequestError(message, USABLE_PYTHON, "environment", event.stderr))
