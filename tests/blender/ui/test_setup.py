@@ -38,7 +38,7 @@ def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
     monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: tmp_path / "eigener ordner")
     monkeypatch.setattr(places, "backend_module_path", lambda: FAKE_CHILD)
     monkeypatch.setattr("blender_primdiffusion.ui.setup.backend_module_path", lambda: FAKE_CHILD)
-    monkeypatch.setattr(preferences, "_own_python_will_do", lambda: False)
+    monkeypatch.setattr(preferences, "own_python_has_backend", lambda **_: False)
     monkeypatch.setattr(ui_setup, "available", lambda: {"cpu": lock})
     bpy.context.preferences.system.use_online_access = False
     session.error = session.notice = ""
