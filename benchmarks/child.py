@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -107,9 +107,8 @@ def death_seconds(timer: Timer, folder: Path) -> float:
     return seconds
 
 
-def this_python() -> Generator[None, None, BackendClient]:
+def this_python() -> BackendClient:
     """The real child, run by the Python that runs this script."""
-    yield
     return BackendClient(Path(sys.executable))
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from blender_primdiffusion.scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera
+from blender_primdiffusion.scene.place import frame_box, humans_extent, new_camera
+from blender_primdiffusion.scene.volume_nodes import fit_cycles_to_volumes
 
 
 def setup_cycles_preview(
@@ -22,6 +23,7 @@ def setup_cycles_preview(
     film. The view transform is Standard, so that the picture has the colours of the volumes. A picture of 384 x 384 at
     one sample took a minute on two idle cores (docs/results/demo.json). Raises ValueError for a scene without humans.
     """
+    bpy.context.view_layer.update()
     extent = humans_extent(scene)
     scene.render.engine = "CYCLES"
     fit_cycles_to_volumes(scene, samples)

@@ -172,8 +172,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     """Generate, pose and delete repeatedly; measures memory growth, stray files and stray processes."""
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
-    from blender_primdiffusion.scene.human import humans, parts_of
-    from blender_primdiffusion.scene.payload import session_folder
+    from blender_primdiffusion.scene.human import humans, parts_of, session_folder
 
     context, megabytes, blender = bpy.context, [], []
     context.preferences.edit.undo_steps = UNDO_STEPS

@@ -56,7 +56,7 @@ from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.edit import select_human
 from blender_primdiffusion.scene.place import stand_at_cursor
-from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import write_volumes
 
 FRAMES = 60
 _ENTERING = (

@@ -39,8 +39,7 @@ from blender_primdiffusion.scene import merged as merging
 from blender_primdiffusion.scene.armature import keyframe_poses, model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.representation import set_representation, show_in_viewport
-from blender_primdiffusion.scene.volume_files import files_of, write_volumes
-from blender_primdiffusion.scene.volume_nodes import density_gain
+from blender_primdiffusion.scene.volume_nodes import density_gain, files_of, write_volumes
 
 SEED, STEPS, SIZE, GREY = 7, 30, 512, 0.48
 FRAMES = 10

@@ -43,7 +43,7 @@ from blender_primdiffusion.scene.human import parts_of
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.rest_human import shape_model_of
+from blender_primdiffusion.scene.human_file import shape_model_of
 
 MOVES, QUICK_MOVES = 30, 5
 MEAN = torch.zeros(10)

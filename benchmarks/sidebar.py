@@ -251,7 +251,7 @@ def measured() -> dict[str, float]:
     from blender_primdiffusion.jobs.queue import JobOutcome, queue
     from blender_primdiffusion.scene import shape
     from blender_primdiffusion.scene.build import build_human
-    from blender_primdiffusion.scene.rest_human import shape_model_of
+    from blender_primdiffusion.scene.human_file import shape_model_of
     from blender_primdiffusion.ui import generate_panel
 
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -76,36 +76,18 @@ def separate_stdout() -> Iterator[Callable[[str], None]]:
         os.close(ours)
 
 
-class Stop:
-    """Whether a command should stop; checked between pieces of work."""
-
-    def __init__(self, ended: Callable[[], bool] = lambda: False) -> None:
-        """`ended` is another reason to stop, checked each time."""
-        self._asked = False
-        self.ended = ended
-
-    def set(self) -> None:
-        self._asked = True
-
-    def is_set(self) -> bool:
-        self._asked = self._asked or self.ended()
-        return self._asked
-
-
 @contextlib.contextmanager
-def stopped_by_signals() -> Iterator[Stop]:
-    """Set by Ctrl-C or SIGTERM; a second signal ends the process at once.
+def stopped_by_signals() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM has come; a second signal ends the process at once.
 
     An exception would be lost: raised while Cycles calls Python, it is only printed.
     """
-    stop = Stop()
     asked = []
 
     def note(*_: object) -> None:
         if asked:
             os._exit(CANCELLED)
         asked.append(True)
-        stop.set()
 
     before = {}
     try:
@@ -114,7 +96,7 @@ def stopped_by_signals() -> Iterator[Stop]:
     except ValueError:  # not in the main thread
         pass
     try:
-        yield stop
+        yield lambda: bool(asked)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)

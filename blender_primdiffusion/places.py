@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Generator
 from pathlib import Path
 
 import bpy
@@ -42,7 +41,7 @@ def backend_is_named() -> bool:
     """Whether there is a backend to try. The viewer has none until the user has installed one."""
     if backend_module_path() is not None:
         return True
-    own = environment.own_python_has_backend()
+    own = environment.own_python_has_backend(bundled=False)
     try:
         named = environment.candidates(preference("backend_python"), None, installed_backend(), own_python=own)
         return next(named, None) is not None
@@ -96,13 +95,8 @@ def new_backend(python: str) -> Backend:
     module_path, cache = backend_module_path(), cache_folder()
     own_environment = set_up_folder().environment
 
-    def make_client() -> Generator[None, None, BackendClient]:
-        installed = installed_backend()
-        found = yield from environment.search(
-            python or None, own_environment, module_path, installed=installed, cache_dir=cache
-        )
-        made = BackendClient(found.path, module_path, cache_dir=cache)
-        made.info["torch"] = found.torch  # the child does not report it
-        return made
+    def make_client() -> BackendClient:
+        _, found = environment.find_python(python or None, own_environment, module_path, installed_backend())
+        return BackendClient(found, module_path, cache_dir=cache)
 
     return Backend(make_client)

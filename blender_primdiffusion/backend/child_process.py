@@ -28,83 +28,35 @@ from typing import IO
 if sys.platform == "win32":
     import msvcrt
 
-Table = Mapping[str, str]
-"""Names, or beginnings of names with a "*", each with the reason for passing it on."""
-
-SYSTEM: Table = {
-    "PATH": "programs that torch and numba start (compilers), and on Windows the folders of libraries",
-    "HOME": "caches and settings of libraries on Linux and macOS",
-    "USERPROFILE": "the same on Windows",
-    "USER": "names of torch's temporary folders",
-    "LOGNAME": "the same, looked up first",
-    "USERNAME": "the same on Windows",
-    "APPDATA": "settings of libraries on Windows",
-    "LOCALAPPDATA": "caches of libraries on Windows",
-    "XDG_CACHE_HOME": "caches of libraries on Linux",
-    "XDG_CONFIG_HOME": "settings of libraries on Linux",
-    "TMPDIR": "temporary files on Linux and macOS",
-    "TEMP": "temporary files on Windows",
-    "TMP": "the same, for programs that look it up first",
-    "LANG": "the encoding of file names",
-    "LC_*": "the same, by category",
-    "LANGUAGE": "the language of the system's error texts",
-    "TZ": "times in records",
-    "SYSTEMROOT": "Windows' sockets and random numbers do not start without it",
-    "SYSTEMDRIVE": "paths of Windows' own libraries",
-    "WINDIR": "the same, for older libraries",
-    "COMSPEC": "Windows' shell, through which compilers are started",
-    "PATHEXT": "endings of programs on Windows",
-    "PROGRAMDATA": "settings of drivers on Windows",
-    "PROGRAMFILES*": "where compilers and CUDA are on Windows",
-    "NUMBER_OF_PROCESSORS": "the number of threads on Windows",
-    "PROCESSOR_*": "the processor's kind on Windows (platform.machine)",
-    "LD_LIBRARY_PATH": "where clusters keep CUDA; unlike LD_PRELOAD it loads no library that is not asked for",
-    "DYLD_FALLBACK_LIBRARY_PATH": "the same on macOS; it is searched last",
-}
-"""Variables that programs need to run on this system."""
-COMPUTING: Table = {
-    "PRIMDIFFUSION_*": "our own settings: device, cache, assets",
-    "CUDA_*": "which GPUs are used, where CUDA is installed, and its cache",
-    "NVIDIA_*": "GPUs and drivers in containers",
-    "HIP_VISIBLE_DEVICES": "which AMD GPUs are used",
-    "ROCR_VISIBLE_DEVICES": "the same, one layer below",
-    "HSA_OVERRIDE_GFX_VERSION": "AMD GPUs that ROCm does not name itself",
-    "OMP_*": "threads of torch and numba",
-    "KMP_*": "threads of Intel's OpenMP: how they wait and where they run",
-    "MKL_*": "threads of MKL",
-    "OPENBLAS_NUM_THREADS": "threads of numpy and scipy",
-    "VECLIB_MAXIMUM_THREADS": "the same on macOS",
-    "NUMEXPR_NUM_THREADS": "limits of clusters, set with the others",
-    "NUMBA_*": "threads and cache of compiled kernels",
-    "PYTORCH_*": "torch's allocator and fallback on Apple GPUs",
-    "TORCH_*": "torch's instruction sets and cache",
-    "TORCHINDUCTOR_CACHE_DIR": "the cache of torch.compile",
-    "TRITON_CACHE_DIR": "the cache of kernels on GPUs",
-    "SLURM_*": "processors and GPUs that a cluster has assigned",
-}
+SYSTEM = (
+    "PATH", "PATHEXT", "COMSPEC",  # compilers and other programs that torch and numba start
+    "HOME", "USERPROFILE", "APPDATA", "LOCALAPPDATA", "XDG_CACHE_HOME", "XDG_CONFIG_HOME",  # caches, settings
+    "USER", "LOGNAME", "USERNAME",  # names of torch's temporary folders
+    "TMPDIR", "TEMP", "TMP",
+    "LANG", "LC_*", "LANGUAGE", "TZ",  # the encoding of file names, the system's error texts, times in records
+    "SYSTEMROOT", "SYSTEMDRIVE", "WINDIR", "PROGRAMDATA", "PROGRAMFILES*",  # Windows' libraries, drivers and compilers
+    "NUMBER_OF_PROCESSORS", "PROCESSOR_*",  # the processor's kind and the number of threads on Windows
+    "LD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH",  # where clusters keep CUDA; they load nothing unasked
+)  # fmt: skip
+"""Variables that programs need to run on this system; with a "*", all that begin so."""
+COMPUTING = (
+    "PRIMDIFFUSION_*",  # our own settings: device, cache, assets
+    "CUDA_*", "NVIDIA_*", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES", "HSA_OVERRIDE_GFX_VERSION",  # GPUs and drivers
+    "OMP_*", "KMP_*", "MKL_*", "OPENBLAS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS",  # threads
+    "NUMBA_*", "PYTORCH_*", "TORCH_*", "TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR",  # allocators, compiled kernels
+    "SLURM_*",  # processors and GPUs that a cluster has assigned
+)  # fmt: skip
 """Settings of what the backend computes with."""
-NETWORK: Table = {
-    "HTTP_PROXY": "the way to the package index",
-    "HTTPS_PROXY": "the same",
-    "ALL_PROXY": "the same",
-    "NO_PROXY": "hosts that are reached directly",
-    "SSL_CERT_FILE": "certificates of a company's network",
-    "SSL_CERT_DIR": "the same",
-    "REQUESTS_CA_BUNDLE": "the same, for the installer",
-    "CURL_CA_BUNDLE": "the same, looked up next",
-    "PIP_*": "the installer's mirror, certificate and time limits; what would install elsewhere is in NEVER",
-    "NETRC": "the mirror's password, which a settings file may hold",
-}
+NETWORK = (
+    "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY",
+    "SSL_CERT_FILE", "SSL_CERT_DIR", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE",  # certificates of a company's network
+    "PIP_*", "NETRC",  # the installer's mirror, its password, certificate and time limits
+)  # fmt: skip
 """For set-up alone: no other program uses the network."""
-BLENDER: Table = {
-    "BLENDER_*": "folders of Blender's settings and scripts",
-    "CYCLES_*": "Cycles' devices and kernels",
-    "OCIO": "the colour management that a studio uses",
-    "DISPLAY": "Blender's GPU back ends on X11",
-    "XAUTHORITY": "the same: the right to use it",
-    "WAYLAND_DISPLAY": "the same on Wayland",
-    "XDG_RUNTIME_DIR": "the same: where its socket is",
-}
+BLENDER = (
+    "BLENDER_*", "CYCLES_*", "OCIO",  # folders of settings and scripts, devices, colour management
+    "DISPLAY", "XAUTHORITY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR",  # Blender's GPU back ends on X11 and Wayland
+)  # fmt: skip
 """For another Blender that renders captures or tests Cycles."""
 NEVER = ("PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_USER", "PIP_PYTHON", "CUDA_INJECTION64_PATH")
 """Names that a pattern above contains, but that would install elsewhere or load a library into the process."""
@@ -116,7 +68,7 @@ LOG_BYTES = 1 << 16
 LOG_LINES = 200
 
 
-def passed_on(*tables: Table, variables: Mapping[str, str] | None = None) -> dict[str, str]:
+def passed_on(*tables: tuple[str, ...], variables: Mapping[str, str] | None = None) -> dict[str, str]:
     """The variables of this process (or of `variables`) that are in SYSTEM or in one of the `tables`.
 
     Names are compared without case: Windows does not distinguish it, and proxies are in lower case on Linux.

@@ -120,6 +120,8 @@ class BackendClient:
         cache_dir: Path | None = None,
         silence_s: float = SILENCE_S,
     ):
+        self.python = python
+        """Of the child, or its program."""
         self._command = [str(python), "serve"] if is_program(python) else [str(python), "-m", f"{PROGRAM}.serve"]
         self._environment = child_environment(module_path, cache_dir, env or {})
         self._silence_s = silence_s

@@ -1,21 +1,19 @@
-"""Which Python runs the backend: found and tried before a child is started with it."""
+"""Which Python runs the backend, and the extension's own environment. Nothing is started to find out."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import os
-import subprocess
 import sys
-import time
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from ..files.json_files import parse_json, read_json
+from ..files.json_files import read_json
 from ..files.regular_files import is_local_path
-from .child_process import Output
-from .client import PROGRAM, child_environment, is_program
+from .client import PROGRAM
 
 VARIABLE = "PRIMDIFFUSION_PYTHON"
 MARK = "ready.json"
@@ -24,16 +22,6 @@ LONGEST_INSIDE = 180
 """Characters of the longest path within site-packages (171 in torch 2.13), and some to spare."""
 WINDOWS_LONGEST = 259
 """Characters of a whole path on Windows as it comes."""
-TRIAL_S = 90.0
-"""A first import of torch from a slow disk, with a virus scanner, takes most of a minute."""
-TRIAL = (
-    "import sys; sys.version_info >= (3, 11) or sys.exit('it is Python %d.%d, and 3.11 or newer is needed' "
-    "% sys.version_info[:2]); import json, primdiffusion, torch; "
-    "print(json.dumps({'version': primdiffusion.__version__, 'torch': torch.__version__, "
-    "'python': sys.version.split()[0]}))"
-)
-
-
 NOT_INSTALLED = (
     "there is no backend on this computer: install PrimDiffusion's as the manual describes, then name its program "
     "or its Python in the extension's preferences"
@@ -44,34 +32,17 @@ NOT_ABSOLUTE = (
     "whole path on this computer (without Relative Path in the file browser)"
 )
 """For paths of preferences: a stranger's folder must not supply what they name."""
-tried: dict[Path, bool] = {}
-"""Interpreters that were tried since Blender was started, and whether they imported torch and the backend."""
+NOT_SET_UP = (
+    "the backend is not set up: press Set Up Backend, or name a Python with PrimDiffusion's packages in the preferences"
+)
+"""Where the extension brings one."""
 
 
 class BackendNotFound(RuntimeError):
-    """No Python that can run the backend; the message names each that was tried and why it will not do."""
+    """No Python to run the backend, or one that must not be."""
 
     kind = "environment"
     """The kind of the error that a request becomes."""
-
-
-class ImportTimedOut(BackendNotFound):
-    """A Python took too long to import torch; on a busy machine another attempt may succeed."""
-
-    kind = "timeout"
-
-
-@dataclasses.dataclass(frozen=True)
-class BackendPython:
-    """An interpreter that has imported torch and the backend."""
-
-    path: Path
-    source: str
-    """Who named it, in words for the user."""
-    version: str
-    """primdiffusion's version."""
-    torch: str
-    python: str
 
 
 def python_of_environment(folder: Path) -> Path:
@@ -156,92 +127,33 @@ def candidates(
         yield f"the environment variable {VARIABLE}", Path(os.environ[VARIABLE])
         return
     if own_environment is not None and (own_environment / MARK).exists():
-        yield "the extension's own environment", python_of_environment(own_environment)
+        python = python_of_environment(own_environment)
+        if python.exists():
+            yield "the extension's own environment", python
     if installed is not None:
         yield "the PATH", installed
     if own_python:
         yield "Blender's own Python", Path(sys.executable)
 
 
-def own_python_has_backend() -> bool:
-    """Whether the backend is installed in Blender's own Python."""
-    return importlib.util.find_spec(PROGRAM) is not None
+@functools.cache
+def own_python_has_backend(bundled: bool) -> bool:
+    """Whether Blender's own Python has the backend, or torch for one that the extension brings."""
+    return importlib.util.find_spec("torch" if bundled else PROGRAM) is not None
 
 
-def search(
+def find_python(
     preference: str | Path | None = None,
     own_environment: Path | None = None,
     module_path: Path | None = None,
-    *,
     installed: Path | None = None,
-    cache_dir: Path | None = None,
-    timeout_s: float = TRIAL_S,
-) -> Generator[None, None, BackendPython]:
-    """Try each candidate in a process of its own, which takes seconds; yields while it runs, and returns the first that
-    imports primdiffusion and torch.
+) -> tuple[str, Path]:
+    """The first of `candidates`: who names it, and the path of the Python or program.
 
-    `installed` as in `candidates`; `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with
-    one reason for each candidate, ImportTimedOut where one of them took longer than `timeout_s`.
+    `module_path` as in `child_environment`. Raises BackendNotFound where there is none.
     """
-    environment = child_environment(module_path, cache_dir, {})
-    errors: list[BackendNotFound] = []
-    own_python = module_path is not None or own_python_has_backend()
-    for source, path in candidates(preference, own_environment, installed, own_python=own_python):
-        try:
-            found = yield from _try(path, source, environment, timeout_s)
-        except BackendNotFound as e:
-            errors.append(e)
-            tried[path] = False
-        else:
-            tried[path] = True
-            return found
-    reasons = "; ".join(map(str, errors))
-    if not errors:
-        raise BackendNotFound(NOT_INSTALLED)
-    advice = "name a Python with PrimDiffusion's packages in the extension's preferences"
-    if module_path is not None:
-        advice = f"press Set Up Backend, or {advice}"
-    if any(isinstance(error, ImportTimedOut) for error in errors):
-        raise ImportTimedOut(f"No Python for the backend: the machine may be busy, try again; or {advice}. {reasons}.")
-    raise BackendNotFound(f"No Python for the backend: {advice}. {reasons}.")  # Blender's report cuts the end
-
-
-def _try(
-    path: Path, source: str, environment: Mapping[str, str], timeout_s: float
-) -> Generator[None, None, BackendPython]:
-    named = f"{path} ({source})"
-    answer, errors = Output(), Output()
-    try:
-        process = subprocess.Popen(
-            [str(path), "serve", "--about"] if is_program(path) else [str(path), "-c", TRIAL],
-            stdin=subprocess.DEVNULL,
-            stdout=answer.target,
-            stderr=errors.target,
-            env=dict(environment),
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
-        end = time.monotonic() + timeout_s
-        try:
-            while (exit_code := process.poll()) is None:
-                if time.monotonic() > end:
-                    raise ImportTimedOut(f"{named} did not import torch within {timeout_s:.0f} s")
-                yield
-        finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-        answered, complaints = answer.log(), errors.log()
-    except FileNotFoundError as e:
-        raise BackendNotFound(f"{named} does not exist") from e
-    except OSError as e:
-        raise BackendNotFound(f"{named} cannot be run: {e.strerror}") from e
-    finally:
-        answer.close()
-        errors.close()
-    if exit_code != 0:
-        raise BackendNotFound(f"{named} cannot run it: {complaints[-1] if complaints else f'exit code {exit_code}'}")
-    try:
-        about = parse_json(answered[-1])
-        return BackendPython(path, source, about["version"], about["torch"], about["python"])
-    except (ValueError, IndexError, KeyError) as e:
-        raise BackendNotFound(f"{named} is no Python interpreter: it answered {answered[:1]}") from e
+    own_python = own_python_has_backend(module_path is not None)
+    found = next(candidates(preference, own_environment, installed, own_python=own_python), None)
+    if found is None:
+        raise BackendNotFound(NOT_INSTALLED if module_path is None else NOT_SET_UP)
+    return found

@@ -55,11 +55,11 @@ END_S = 2.0
 class Backend:
     """The child that requests share: started at first use, kept warm, restarted after it died.
 
-    Blender may be closed between any two calls, so what takes long is a generator that yields while it waits.
+    No call waits for it.
     """
 
-    def __init__(self, make_client: Callable[[], Generator[None, None, BackendClient]]):
-        """`make_client` finds a Python and returns a client not yet started; yields while it looks for one."""
+    def __init__(self, make_client: Callable[[], BackendClient]):
+        """`make_client` finds a Python and returns a client not yet started."""
         self._make_client = make_client
         self._client: BackendClient | None = None
         self._ending: list[tuple[BackendClient, float, Callable[[], None]]] = []
@@ -80,14 +80,14 @@ class Backend:
         client = self._client
         return client if client is not None and client.alive else None
 
-    def connecting(self) -> Generator[None, None, BackendClient]:
-        """The running child, started now if there is none, which takes seconds. Raises BackendNotFound or OSError."""
+    def connected(self) -> BackendClient:
+        """The running child, started now if there is none. Raises BackendNotFound or OSError."""
         running = self.client
         if running is not None:
             return running
-        client = yield from self._make_client()
         if self._closed:
-            raise RuntimeError("the backend was shut down while it was starting")
+            raise RuntimeError("the backend was shut down")
+        client = self._make_client()
         client.start()
         self._client = client
         return client
@@ -186,9 +186,13 @@ class RequestError:
         return " ".join(sentence(part) for part in (self.message, self.remedy) if part)
 
 
+USABLE_PYTHON = "Name a Python 3.11 or newer with PrimDiffusion's packages in the extension's preferences"
+
+
 def connecting_error(error: Exception) -> RequestError:
     """The error of a request for which no child could be started."""
-    return RequestError(str(error) or type(error).__name__, "", getattr(error, "kind", "environment"))
+    remedy = USABLE_PYTHON if isinstance(error, OSError) else ""
+    return RequestError(error_text(error) or type(error).__name__, remedy, getattr(error, "kind", "environment"))
 
 
 class ChildRequest:
@@ -226,7 +230,6 @@ class ChildRequest:
         self.result: Any = None
         """The child's answer: a record of `formats.answers`."""
         self.error: RequestError | None = None
-        self._connecting = backend.connecting()
         if not backend.start(self):
             self._fail(RequestError("the backend is at work already", "wait for it, or cancel it first", "busy"))
 
@@ -278,17 +281,15 @@ class ChildRequest:
 
     def _tick_start(self) -> None:
         if self._cancel_asked_at is not None:
-            self._connecting.close()
             self._end("cancelled", "Cancelled")
             return
         try:
-            next(self._connecting)
-        except StopIteration as connected:
-            self._client = client = connected.value
-            if not client.info.get("ready"):
-                self.message = "Loading PyTorch"
+            self._client = self._backend.connected()
         except Exception as error:  # any error must reach the user
             self._fail(connecting_error(error))
+        else:
+            if not self._client.info.get("ready"):
+                self.message = "Loading PyTorch"
 
     def _ask(self, client: BackendClient) -> None:
         """Send the request, once the child has ended an abandoned one."""
@@ -316,6 +317,10 @@ class ChildRequest:
             self._clear_leftovers()
             if self._cancel_asked_at is not None:
                 self._end("cancelled", "Cancelled")
+            elif self._client is not None and not self._client.info:  # it never spoke
+                said = event.stderr[-1] if event.stderr else event.message
+                message = f"{self._client.python} cannot run the backend: {said}"
+                self._fail(RequestError(message, USABLE_PYTHON, "environment", event.stderr))
             else:
                 remedy = f"Try again; if it was the memory, {memory_advice(self._params)}"
                 self._fail(RequestError(event.message, remedy, "died", event.stderr))

@@ -24,7 +24,7 @@ from typing import Any
 from ..files.regular_files import check_regular, remove_file, remove_folder
 from ..files.whole_files import write_atomically
 from .client import BackendClient
-from .environment import MARK, SetUpFolder, search, tried
+from .environment import MARK, SetUpFolder
 from .packages import Lock, clean_environment, followed, what_went_wrong
 from .requests import Backend, ChildRequest, Step, Steps
 
@@ -32,8 +32,6 @@ OFFLINE = (
     "Blender may not use the network; allow it in Preferences > System > Network > Allow Online Access, "
     "or use Install from Folder"
 )
-TRIAL_S = 300.0
-"""A first import of torch compiles its byte code; a virus scanner reads along."""
 _TRIAL = {"seed": 0, "steps": 3, "size": 16}
 _DOWNLOADED, _INSTALLED = 0.6, 0.9
 """Of the bar, when these are done."""
@@ -109,13 +107,7 @@ def _trial(
     The human's previews are drawn, which compiles the marcher into `cache`: the first press does not wait for that.
     """
 
-    def make_client() -> Generator[None, None, BackendClient]:
-        found = yield from search(python, module_path=module_path, cache_dir=cache, timeout_s=TRIAL_S)
-        client = BackendClient(found.path, module_path, cache_dir=cache)
-        client.info.update(torch=found.torch, python=found.python, version=found.version)
-        return client
-
-    backend, began = Backend(make_client), time.monotonic()
+    backend, began = Backend(lambda: BackendClient(python, module_path, cache_dir=cache)), time.monotonic()
     person = temporary / "person"
     try:
         request = ChildRequest(backend, "generate", {**_TRIAL, "out_dir": str(person)})
@@ -123,7 +115,6 @@ def _trial(
             yield Step(f"Testing the backend, which compiles its renderer, once: {request.message}", _INSTALLED)
             request.tick()
         if request.error is not None:
-            tried[python] = False
             last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
             raise RuntimeError(f"the self-test failed: {request.error.message}{last}")
         if not request.result.person.is_file():
@@ -131,7 +122,7 @@ def _trial(
         return {
             "device": request.info.get("device_name") or "",
             "seconds": round(time.monotonic() - began, 1),
-            **{name: request.info[name] for name in ("torch", "python", "version")},
+            **{name: request.info.get(name, "?") for name in ("torch", "python", "version")},
         }
     finally:
         backend.release()

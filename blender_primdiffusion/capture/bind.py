@@ -17,8 +17,8 @@ from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
 from .body import Body, blend, fit_surface, vertex_normals
 from .registration import Registration, axis_name, register, scale_note
+from .rigged import mesh_points
 from .scan_files import Parameters, ScanFile, read_parameters
-from .skinned_surface import mesh_points
 
 _FAR_M, _LOOSE_M = 0.10, 0.06
 """Mean distance beyond which a scan is not of this body; distance at which a point's nearest place means little."""

@@ -27,7 +27,6 @@ from ..console import (
     UNUSABLE,
     CommandParser,
     Report,
-    Stop,
     Stopped,
     duration,
     report_path,
@@ -161,8 +160,8 @@ def main(argv: Sequence[str]) -> int:
     with separate_stdout() as write:
         say = _json_lines(write) if options.progress == "json" else write
         try:
-            with stopped_by_signals() as stop:
-                return _run(options, say, stop)
+            with stopped_by_signals() as stopped:
+                return _run(options, say, stopped)
         except (OSError, ValueError) as error:
             print(printable(f"capture: {error}"), file=sys.stderr, flush=True)
             return UNUSABLE
@@ -191,7 +190,7 @@ def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
-def _run(options: argparse.Namespace, say: Say, stop: Stop) -> int:
+def _run(options: argparse.Namespace, say: Say, stopped: Callable[[], bool]) -> int:
     if options.verify or (options.repair and not options.people):
         return _check(options, say)
     if options.repair and options.out.exists():
@@ -205,9 +204,7 @@ def _run(options: argparse.Namespace, say: Say, stop: Stop) -> int:
         for scan in scans[index::count]:
             say(scan.name)
         return DONE
-    if options.while_stdin:
-        stop.ended = stdin_has_ended
-    return _render(options, settings, scans, say, stop)
+    return _render(options, settings, scans, say, stopped)
 
 
 def _check(options: argparse.Namespace, say: Say) -> int:
@@ -220,7 +217,9 @@ def _check(options: argparse.Namespace, say: Say) -> int:
     return FAILED if wrong else DONE
 
 
-def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say, stop: Stop) -> int:
+def _render(
+    options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say, stopped: Callable[[], bool]
+) -> int:
     try:
         settings.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -237,7 +236,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
                 if time.monotonic() - printed > _PRINT_S or progress.done == progress.total:
                     printed = time.monotonic()
                     say(describe(progress))
-            if stop.is_set():
+            if stopped() or (options.while_stdin and stdin_has_ended()):
                 raise Stopped
     say(f"{len(report.done)} done, {len(report.skipped)} were there, {len(report.failed)} failed")
     if report.failed:

@@ -19,20 +19,22 @@ from .body import Body, ShapeFit, fit_joints
 from .registration import stand_up
 from .rigged import (
     RigSkeleton,
+    SkinnedSurface,
     add_root,
     affine,
     bone_heads,
     find_armature,
     free_bones,
     is_evenly_scaled,
+    mesh_points,
     set_at_rest,
     skeleton_of,
+    skinned_surface,
     split_meshes,
     to_backend,
     uniform_scale,
 )
 from .scan_files import ScanFile, import_file, own_betas
-from .skinned_surface import SkinnedSurface, mesh_points, skinned_surface
 from .stage import AddedData
 from .surfaces import complete_colours
 

@@ -12,8 +12,6 @@ from .engine import ENGINE, PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine
 from .gpu import overlay
 from .who_draws import view_engine
 
-CHECK_S = 5.0
-"""Between checks on a child that may be idle, which is stopped after a while."""
 _draw_handlers: list[object] = []
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)
 
@@ -23,7 +21,6 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_render = bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_render)
-    bpy.app.timers.register(_check_child, first_interval=CHECK_S, persistent=True)
     if not bpy.app.background:
         _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw_humans, (), "WINDOW", "POST_VIEW"))
         _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw_error, (), "WINDOW", "POST_PIXEL"))
@@ -33,8 +30,6 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register` and stop the child; scenes that used the engine return to Blender's default."""
-    if bpy.app.timers.is_registered(_check_child):
-        bpy.app.timers.unregister(_check_child)
     while _draw_handlers:
         bpy.types.SpaceView3D.draw_handler_remove(_draw_handlers.pop(), "WINDOW")
     for name, handler in _handlers():
@@ -91,11 +86,6 @@ def _scene_changed(*_given: object) -> None:
 @bpy.app.handlers.persistent
 def _depsgraph_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     overlay.overlay.scene_changed(update.id for update in depsgraph.updates)
-
-
-def _check_child() -> float:
-    drawing_child.end_when_idle()
-    return CHECK_S
 
 
 def _reset_scenes() -> None:

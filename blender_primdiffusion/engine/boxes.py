@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..scene.human_file import HumanPayload, file_version, read_sizes
-from ..scene.rest_human import body_of_file
+from ..scene.human_file import HumanPayload, read_sizes, session_body
 from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, stretch_of, tangent_frames
 from .picture import PosedHuman
 from .view import PinholeView
@@ -132,7 +131,7 @@ def boxes_of(human: PosedHuman) -> Boxes:
     Raises FileNotFoundError or ValueError for a file of the human or its body that is missing or damaged, and as
     `BoxRig.place`.
     """
-    return _rig(body_of_file(human.file)).place(human, read_sizes(file_version(human.file)))
+    return _rig(session_body(human.file)).place(human, read_sizes(human.file))
 
 
 @functools.lru_cache(maxsize=4)

@@ -9,8 +9,8 @@ import bpy
 from ..backend.requests import ChildRequest
 from ..formats.requests import RAY_STEP
 from . import drawing_child
+from .drawing_child import Frame, frames
 from .picture import scene_content, solids_file
-from .shared_frames import Frame, frames
 from .view import PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
 from .who_draws import ENGINE

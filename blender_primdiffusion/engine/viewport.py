@@ -15,8 +15,7 @@ from .gpu.march import gpu_marcher
 from .gpu.picture import GpuPicture, GpuScene, GpuSolids
 from .gpu.refine import GpuRefinement, MarchRequest
 from .gpu.scene_reading import gpu_humans
-from .picture import SceneContent, scene_content
-from .solids import SceneSolids, changed_by, scene_solids
+from .picture import SceneContent, SceneSolids, changed_by, scene_content, scene_solids
 from .view import camera_frame, region_view
 
 Region = tuple[int, int, int, int]

@@ -1,4 +1,4 @@
-"""Exports of humans: textured meshes, .human files, 3D Gaussians and VDB sequences; imports of .human files."""
+"""Exports of humans: textured meshes, .human files, 3D Gaussians, VDB sequences, assets; imports of .human files."""
 
 from __future__ import annotations
 
@@ -15,33 +15,38 @@ import numpy as np
 from ..engine.picture import pose_of
 from ..files.regular_files import exists_in_its_folder, remove_file
 from ..files.whole_files import written_whole
-from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
-from ..formats.poses.rotation import nearest
-from ..formats.poses.skeleton import unchain
-from ..motion.posture import rest_joints
+from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer, RenderAnswer
+from ..formats.joints import JOINT_NAMES
+from ..motion.placing import sample_motion
+from ..scene.actions import posed_on
 from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
-from ..scene.export_model import FrameRange, scene_with_only, write_model
-from ..scene.human import link_part, proxy_of
+from ..scene.blend_values import as_shown
+from ..scene.human import BODY_FILE, PERSON_FILE, HumanTarget, link_part, provenance_of, proxy_of, session_file
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
     compacted,
     expanded,
     motion_in,
+    read_human,
     read_tensors,
     reshaped,
+    shape_model_of,
     with_motion,
     write_tensors,
 )
 from ..scene.merged import read_grid, write_grid
-from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
-from ..scene.proxy import build_proxy, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.proxy import (
+    build_proxy,
+    read_proxy,
+    remove_proxy,
+    show_textures_in_solid,
+    write_model,
+)
 from ..scene.representation import MESH_IN_VIEWPORT, set_representation
-from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
-from .target import HumanTarget
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +83,8 @@ class ExportMeshJob(ProxyJob):
 
     path: Path
     format: str
-    frames: FrameRange
+    frames: range
+    """One is a pose."""
 
     @property
     def label(self) -> str:
@@ -93,7 +99,7 @@ class ExportMeshJob(ProxyJob):
         finally:
             remove_proxy(proxy)
         size = self.path.stat().st_size / 1e6
-        frames = f", {self.frames.last - self.frames.first + 1} frames" if self.frames.animated else ""
+        frames = f", {len(self.frames)} frames" if len(self.frames) > 1 else ""
         return f"Exported {person.name} to {self.path.name}: {result.triangles} triangles{frames}, {size:.1f} MB"
 
 
@@ -120,11 +126,11 @@ class AddProxyJob(ProxyJob):
         return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
 
 
-def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
+def scene_frames(scene: bpy.types.Scene, animated: bool) -> range:
     """The scene's range, or the current frame."""
     if animated:
-        return FrameRange(scene.frame_start, scene.frame_end)
-    return FrameRange(scene.frame_current, scene.frame_current)
+        return range(scene.frame_start, scene.frame_end + 1)
+    return range(scene.frame_current, scene.frame_current + 1)
 
 
 def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: Iterable[int]) -> list[dict[str, Any]]:
@@ -133,21 +139,15 @@ def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: I
     Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
     """
     check_joints(person)
-    found = []
-    with scene_with_only(context, person) as scene:
-        for frame in frames:
-            if frame != scene.frame_current:
-                scene.frame_set(frame)
-            evaluated = person.evaluated_get(scene.view_layers[0].depsgraph)
-            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64)).params())
-    return found
+    shown = posed_on(context, person, frames)
+    return [pose_of(one, np.array(one.matrix_world, np.float64)).params() for one in shown]
 
 
 def write_human(
     context: bpy.types.Context,
     person: bpy.types.Object,
     path: Path,
-    frames: FrameRange | None,
+    frames: range | None,
     *,
     compact: bool = False,
 ) -> None:
@@ -162,23 +162,11 @@ def write_human(
     if has_custom_shape(person):
         betas = betas_of(person)
         human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
-    motion = None if frames is None else _motion(context, person, frames)
+    motion = None
+    if frames is not None:
+        moved, _, _ = sample_motion(context, person, frames)
+        motion = HumanMotion(np.array(frames), moved.rotations, moved.translations, moved.fps)
     write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
-
-
-def _motion(context: bpy.types.Context, person: bpy.types.Object, frames: FrameRange) -> HumanMotion:
-    numbers = range(frames.first, frames.last + 1)
-    joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
-    pelvis = rest_joints(person)[0]
-    rotations = nearest(joints[..., :3])  # bones may be scaled and mirrored
-    translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
-    render = context.scene.render
-    return HumanMotion(
-        np.array(numbers, np.float32),
-        unchain(rotations).astype(np.float32),
-        translations.astype(np.float32),
-        render.fps / render.fps_base,
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -282,29 +270,22 @@ class ImportHumanJob(Job):
 def opened(source: Path, folder: Path) -> HumanAnswer | None:
     """Write the human of a file, without a motion, into `folder`, and the file of its body where it has one.
 
-    None for files that only the backend can read: humans on a body of the user's files without a good BODY_FILE beside
-    them, and files of other kinds. Raises ValueError for a damaged human, OSError.
+    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
+    and files of other kinds. Raises ValueError for a damaged human, OSError.
     """
     began = time.monotonic()
     try:
         human = read_tensors(source)
     except ValueError:
         return None
-    if "body" in human.metadata and not _has_body(source):
+    body = source.with_name(BODY_FILE) if "body" in human.metadata else None
+    if body is not None and not exists_in_its_folder(body):
         return None
     read_human(source, CHOOSE_ANOTHER)
     write_tensors(folder / PERSON_FILE, with_motion(human, None))
-    if "body" in human.metadata:
-        shutil.copyfile(source.with_name(BODY_FILE), folder / BODY_FILE)
+    if body is not None:
+        shutil.copyfile(body, folder / BODY_FILE)
     return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
-
-
-def _has_body(person: Path) -> bool:
-    """Whether a good BODY_FILE is beside a human's file."""
-    try:
-        return exists_in_its_folder(person.with_name(BODY_FILE)) and bool(body_of_file(person))
-    except (ValueError, OSError):
-        return False
 
 
 def name_of(path: str) -> str:
@@ -328,3 +309,46 @@ def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:
     keyframe_poses(
         armature, np.asarray(motion.frames, np.float64), motion.rotations, motion.translations, armature.name
     )
+
+
+_PICTURE, _SIDE = "asset.png", 256
+_ARMS_DOWN = 1.15
+"""Radians from the T pose, so that a human fills the picture."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanAssetJob(Job):
+    """Draw a picture, then mark the human as an asset. Blender draws none of an armature."""
+
+    kind = "human_asset"
+    method = "render"
+    undo = "Mark Human as Asset"
+
+    target: HumanTarget
+
+    @property
+    def label(self) -> str:
+        return f"Picture of {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        pose = np.zeros((len(JOINT_NAMES), 3))
+        pose[JOINT_NAMES.index("left_shoulder"), 2] = -_ARMS_DOWN
+        pose[JOINT_NAMES.index("right_shoulder"), 2] = _ARMS_DOWN
+        human, out = str(session_file(self.target.found())), str(folder / _PICTURE)
+        return {"human": human, "out": out, "pose": pose.ravel().tolist(), "width": _SIDE, "height": _SIDE}
+
+    def finish(self, _context: bpy.types.Context, _result: RenderAnswer, folder: Path) -> str:
+        person = self.target.found()
+        made = provenance_of(person)
+        asked = made.get("attributes")
+        asked = asked if isinstance(asked, dict) else {}
+        seed = f"seed {as_shown(made['seed'])}" if "seed" in made else "no seed"
+        said = [f"{as_shown(name)} {as_shown(value)}" for name, value in asked.items()]
+        person.asset_mark()
+        about = person.asset_data
+        about.description = ", ".join(["Generated human", seed, *said])
+        for tag in ("human", *(as_shown(value) for value in asked.values() if isinstance(value, str))):
+            about.tags.new(tag, skip_if_exists=True)
+        with bpy.context.temp_override(id=person):
+            bpy.ops.ed.lib_id_load_custom_preview(filepath=str(folder / _PICTURE))
+        return f"{person.name} is an asset now; save the file in a folder of your asset libraries"

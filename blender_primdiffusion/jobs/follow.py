@@ -1,17 +1,20 @@
-"""Follow jobs to their end: by a timer while there is a window, by waiting in background mode."""
+"""Follow work to its end, by a timer while there is a window, by waiting in background mode: the queue's jobs, and
+sessions beside it; and release the memory of children that have been idle."""
 
 from __future__ import annotations
 
+import collections
 import time
 import traceback
 
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
-from ..backend.requests import RequestError, error_text, sentence
+from ..backend.requests import RequestError, Steps, error_text, sentence
+from ..engine import drawing_child
 from ..files.regular_files import printable
-from ..places import backend_is_named
-from .memory import release_when_idle
+from ..places import EXTENSION, backend_is_named
+from ..scene.volumes import free_unused_grids
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .windows import blocking_activity, redraw, window_of
 
@@ -75,6 +78,8 @@ def _leave_edit_mode(context: bpy.types.Context) -> bool:
 
 TICK_S = 0.1
 WATCH_S = 0.25
+_MOST_LINES = 200
+"""Of what a session has said."""
 _PRINT_S = 1.0
 """Between lines of progress on the console in background mode."""
 
@@ -177,3 +182,143 @@ def _wait_for(entry: Entry) -> JobOutcome:
         else:
             time.sleep(TICK_S / 4)
     return queue.last
+
+
+class Session:
+    """Runs the steps of one piece of work at a time, beside the queue. All methods are for Blender's main thread."""
+
+    def __init__(self, busy: str, cancelled: str) -> None:
+        """What to say while there is work, and of work that was cancelled."""
+        self.message = ""
+        self.fraction = 0.0
+        self.lines: collections.deque[str] = collections.deque(maxlen=_MOST_LINES)
+        """What the work has said, newest last."""
+        self.error = ""
+        """Why the last one failed, in a sentence."""
+        self.notice = ""
+        """How the last one ended otherwise."""
+        self._steps: Steps | None = None
+        self._busy, self._cancelled = busy, cancelled
+        self._timer = self._follow  # Blender knows a timer by the object
+
+    @property
+    def busy(self) -> bool:
+        """Whether there is work."""
+        return self._steps is not None
+
+    def start(self, steps: Steps) -> None:
+        """Begin at the next tick. Raises ValueError while there is other work."""
+        if self.busy:
+            raise ValueError(f"{self._busy}: wait for it, or press Cancel")
+        self._steps, self.error, self.notice, self.message, self.fraction = steps, "", "", "Starting", 0.0
+        self.lines.clear()
+
+    def tick(self) -> bool:
+        """Continue; True when something visible changed. At the end `notice` or `error` is set."""
+        if self._steps is None:
+            return False
+        before = (self.message, self.fraction, len(self.lines))
+        try:
+            step = next(self._steps)
+        except StopIteration as done:
+            self._steps, self.notice = None, done.value
+        except (RuntimeError, OSError) as error:
+            self._steps, self.error = None, sentence(error)
+        else:
+            self.message, self.fraction = step.message, step.fraction
+            self.lines += step.lines
+        return not self.busy or before != (self.message, self.fraction, len(self.lines))
+
+    def cancel(self) -> None:
+        """End the work and its processes at once."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps, self.notice = None, self._cancelled
+
+    def close(self) -> None:
+        """As `cancel`, and no timer is left."""
+        self.cancel()
+        if bpy.app.timers.is_registered(self._timer):
+            bpy.app.timers.unregister(self._timer)
+
+    def follow(self, operator: bpy.types.Operator) -> set[str]:
+        """The end of an operator that has started the work: errors are reported in background mode."""
+        if not bpy.app.background:
+            if not bpy.app.timers.is_registered(self._timer):
+                bpy.app.timers.register(self._timer, first_interval=TICK_S, persistent=True)
+            return {"FINISHED"}
+        printed = 0.0
+        try:
+            while self.busy:
+                if self.tick() and self.busy and time.monotonic() - printed > _PRINT_S:
+                    printed = time.monotonic()
+                    print(printable(f"PrimDiffusion: {self.message}"), flush=True)
+                time.sleep(TICK_S / 4)
+        finally:
+            self.cancel()
+        for line in filter(None, (*self.lines, self.notice)):
+            print(printable(f"PrimDiffusion: {line}"), flush=True)
+        if self.error:
+            operator.report({"ERROR"}, self.error)
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def _follow(self) -> float | None:
+        if self.tick():
+            redraw()
+        return TICK_S if self.busy else None
+
+
+IDLE_MINUTES = 10.0
+"""Default, where the preferences have none."""
+
+
+def device_line() -> str:
+    """The device as panels show it: its name, and its total and free memory as far as the child has reported them."""
+    if queue.child_message:
+        return f"{queue.child_message}; restarts with the next human"
+    info = queue.info
+    if not info.get("device_name"):
+        return "starts with the first human"
+    of = "device_memory" if info.get("device_memory_gb") else "memory"
+    total, free = info.get(f"{of}_gb"), info.get(f"{of}_free_gb")
+    if not total:
+        return str(info["device_name"])
+    left = f", {free:.1f} GB free at its start" if free is not None else ""
+    return f"{info['device_name']}, {total:.1f} GB{left}"
+
+
+def idle_minutes() -> float:
+    """Minutes after which an idle child is ended; 0 for never."""
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    return float(getattr(addon.preferences, "idle_minutes", IDLE_MINUTES)) if addon is not None else IDLE_MINUTES
+
+
+def release_when_idle(now: float) -> bool:
+    """End the children after `idle_minutes` without work; whether the one of jobs was ended. `now`: time.monotonic().
+
+    Grids that Blender can read again are freed with it.
+    """
+    minutes = idle_minutes()
+    drawing_child.end_when_idle(minutes * 60)
+    if queue.busy or minutes <= 0 or now - queue.idle_since < minutes * 60:
+        return False
+    if queue.release() is None:
+        return False
+    if not bpy.app.is_job_running("RENDER"):
+        free_unused_grids()
+    return True
+
+
+def release() -> None:
+    """End the children that generate and draw, and free grids that Blender can read again.
+
+    Raises ValueError while one of them is busy.
+    """
+    if queue.busy:
+        raise ValueError("the backend is busy: wait for it, or cancel the job first")
+    if bpy.app.is_job_running("RENDER"):
+        raise ValueError("Blender is rendering: wait for it, or cancel it first")
+    queue.release()
+    drawing_child.close()
+    free_unused_grids()

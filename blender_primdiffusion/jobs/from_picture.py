@@ -19,17 +19,15 @@ from ..files.json_files import read_json
 from ..files.regular_files import as_file_error
 from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
-from ..motion.posture import check_posable, take_world_posture, world_posture
+from ..motion.poses import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import check_no_handles
-from ..scene.human import humans
-from ..scene.payload import BODY
+from ..scene.human import BODY, HumanTarget, humans
 from ..scene.representation import parts_by_representation
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
-from .target import HumanTarget
 
 POSTURE_FORMAT = "primdiffusion-posture"
 """As `reconstruction/posture_start.py` of the backend writes it."""

@@ -91,8 +91,6 @@ class Entry:
     scene: str
     scene_uid: int
     """Valid while the file is open."""
-    asked_at: float
-    """time.monotonic()."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,8 +101,6 @@ class JobOutcome:
     notice: str = ""
     """Message, when it succeeded or was cancelled."""
     error: RequestError | None = None
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """"work" from the click to the child's result, "finish" in the scene."""
 
     @property
     def sentence(self) -> str:
@@ -161,7 +157,7 @@ class Queue:
     def add(self, context: bpy.types.Context, job: Job) -> Entry:
         """Queue `job` for the scene of `context`."""
         scene = context.scene
-        entry = Entry(next(self._numbers), job, scene.name, scene.session_uid, time.monotonic())
+        entry = Entry(next(self._numbers), job, scene.name, scene.session_uid)
         self.waiting.append(entry)
         self.outcomes.pop(job.kind, None)
         return entry
@@ -186,7 +182,7 @@ class Queue:
 
     def finish(self, context: bpy.types.Context) -> JobOutcome:
         """Put the result that is `ready` into the scene of `context`. For the operator that makes the undo step."""
-        entry, began = self.current, time.monotonic()
+        entry = self.current
         if entry is None or not self.ready:
             raise RuntimeError("no result is ready: call tick until ready")
         notice, error = "", None
@@ -197,8 +193,7 @@ class Queue:
         except Exception as e:
             traceback.print_exc()
             error = defect_in_the_scene(e)
-        seconds = {"work": began - entry.asked_at, "finish": time.monotonic() - began}
-        return self._end(JobOutcome(entry, notice, error, seconds))
+        return self._end(JobOutcome(entry, notice, error))
 
     def fail(self, error: RequestError) -> JobOutcome:
         """End the running job with an error, whatever its result."""

@@ -14,9 +14,9 @@ import bpy
 from ..backend.requests import sentence
 from ..files.regular_files import remove_folder
 from ..formats.answers import VariationFiles, VariationsAnswer
-from ..scene.payload import BODY_FILE, PERSON_FILE
-from .pictures import icons
+from ..scene.human import BODY_FILE, PERSON_FILE
 from .queue import Job, chosen_checkpoint
+from .windows import icons
 
 NAMES = {"person": PERSON_FILE, "picture": "picture.png"}
 """Files of a human, by their names in the child's result."""

@@ -1,8 +1,10 @@
-"""An armature's action: its curves, its end, looping, and pushing it down to an NLA strip."""
+"""An armature's action: its curves, its end, looping, pushing it down to an NLA strip; what it shows on each frame."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import bpy
 
@@ -96,3 +98,36 @@ def end_repeat(armature: bpy.types.Object) -> None:
     for curve in action_curves(armature) or ():
         for modifier in [modifier for modifier in curve.modifiers if modifier.type == "CYCLES"]:
             curve.modifiers.remove(modifier)
+
+
+@contextmanager
+def scene_with_only(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
+    """A temporary scene with only the armature, at the current frame: with volumes, evaluation takes far longer.
+
+    An armature that is hidden or shown in rest position is posed meanwhile.
+    """
+    source = context.scene
+    scene = bpy.data.scenes.new(armature.name)
+    before = armature.hide_viewport, armature.data.pose_position
+    try:
+        armature.hide_viewport, armature.data.pose_position = False, "POSE"
+        for name in ("fps", "fps_base"):
+            setattr(scene.render, name, getattr(source.render, name))
+        scene.unit_settings.scale_length = source.unit_settings.scale_length
+        scene.collection.objects.link(armature)
+        scene.frame_set(source.frame_current)
+        yield scene
+    finally:
+        armature.hide_viewport, armature.data.pose_position = before
+        bpy.data.scenes.remove(scene)
+
+
+def posed_on(
+    context: bpy.types.Context, armature: bpy.types.Object, frames: Iterable[int]
+) -> Iterator[bpy.types.Object]:
+    """The evaluated armature on each frame, valid until the next one: see `scene_with_only`."""
+    with scene_with_only(context, armature) as scene:
+        for frame in frames:
+            if frame != scene.frame_current:
+                scene.frame_set(frame)
+            yield armature.evaluated_get(scene.view_layers[0].depsgraph)

@@ -81,14 +81,9 @@ def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
     additional bones stay.
 
     Bones are moved but not turned towards the new joints: with the same axes, a pose or an animation means the same
-    joint rotations as before. Modes, selection and the active object stay too. Raises ValueError when a joint's bone is
-    missing, or the armature is in edit mode.
+    joint rotations as before. Modes, selection and the active object stay too. For an armature that has passed
+    `check_joints`.
     """
-    missing = [name for name in JOINT_NAMES if name not in data.bones]
-    if missing:
-        raise ValueError(f"the armature {data.name!r} has no bone {missing[0]!r}: its shape cannot be changed")
-    if data.is_editmode:
-        raise ValueError(f"the armature {data.name!r} is in Edit Mode: leave it (Tab) to change the shape")
     with editing_bones(data) as bones:
         for name, joint in zip(JOINT_NAMES, joints, strict=True):
             bone = bones[name]
@@ -148,14 +143,9 @@ def check_joints(armature: bpy.types.Object) -> None:
 
 
 def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Rest axes of the bones [24, 3, 3] in the armature's space, in SMPL's joint order.
-
-    Raises ValueError when the armature lacks one of SMPL's joints.
-    """
+    """Rest axes of the bones [24, 3, 3] in the armature's space, in SMPL's joint order. Raises as `check_joints`."""
+    check_joints(armature)
     bones = armature.data.bones
-    missing = [name for name in JOINT_NAMES if name not in bones]
-    if missing:
-        raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}; select a human's armature")
     return np.array([np.array(bones[name].matrix_local.to_3x3()) for name in JOINT_NAMES], np.float64)
 
 

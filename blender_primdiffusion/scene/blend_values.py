@@ -16,14 +16,12 @@ from typing import Any, cast
 import bpy
 
 from ..files.json_files import parse_json
-from ..files.regular_files import is_local_path, printable, real_path
+from ..files.regular_files import is_local_path, printable
 
 LONGEST_TEXT = 1 << 16
 """Characters of a text; the longest is the state of a merged sequence, 20 characters a frame. Panels read texts at each
 draw."""
 LARGEST_NUMBER = 1e6
-_LONGEST_PART = 255
-"""Bytes of a name in a path: file systems take no more, and `stat` raises OSError."""
 _LONGEST_SHOWN = 120
 """Characters of a value in a panel or a message."""
 
@@ -84,10 +82,9 @@ def as_shown(value: object) -> str:
 
 def file_path(stored: str, library: bpy.types.Library | None) -> Path | None:
     """The absolute path of a file that a data-block of this .blend, or of `library`, names; None where it is empty,
-    relative to a .blend that was never saved, on another server, a device or longer than file systems take."""
-    folder, name = os.path.split(bpy.path.abspath(stored, library=library))
-    inside = _folder(folder, bpy.data.filepath) if folder else None
-    return None if inside is None or not _is_name(name) else inside / name
+    relative to a .blend that was never saved, a device, or on another server."""
+    path = bpy.path.abspath(stored, library=library)
+    return Path(path) if _is_near(path) else None
 
 
 def setting_path(stored: str, label: str) -> str:
@@ -95,15 +92,20 @@ def setting_path(stored: str, label: str) -> str:
 
     Raises ValueError for what `file_path` rejects. `label`: what the panel calls the setting.
     """
-    if not stored:
-        return ""
     path = bpy.path.abspath(stored)
-    if _folder(path.rstrip("/\\") or path, bpy.data.filepath) is None:
+    if stored and not _is_near(path):
         raise ValueError(
             f"{label} is {as_shown(stored)!r}, which is not the whole path of a file or folder on this computer: "
             "choose it again"
         )
     return path
+
+
+def _is_near(path: str) -> bool:
+    """Whether a path is of this computer, or of the server from which the user has opened the .blend."""
+    share = PureWindowsPath(path).drive.lower() if os.name == "nt" else ""
+    is_of_blend = share.startswith("\\\\") and share == PureWindowsPath(bpy.data.filepath).drive.lower()
+    return is_local_path(path) or is_of_blend
 
 
 @functools.lru_cache(maxsize=64)
@@ -116,22 +118,5 @@ def _record(text: str) -> dict[str, Any]:
     return record if isinstance(record, dict) else {}
 
 
-@functools.lru_cache(maxsize=256)
-def _folder(path: str, blend: str) -> Path | None:
-    """A folder that a .blend names, without `..`; None for one that must not be looked up. `blend`: the open file."""
-    share = PureWindowsPath(path).drive.lower() if os.name == "nt" else ""
-    is_near = share.startswith("\\\\") and share == PureWindowsPath(blend).drive.lower()  # where the user opened it
-    if not (is_local_path(path) or (is_near and "\0" not in path)):
-        return None
-    folder = Path(path)
-    if not all(_is_name(part) for part in folder.parts[1:] if part != ".."):
-        return None
-    return real_path(folder) if ".." in folder.parts else folder
-
-
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER  # not NaN
-
-
-def _is_name(part: str) -> bool:
-    return part not in ("", ".", "..") and "\0" not in part and len(os.fsencode(part)) <= _LONGEST_PART

@@ -1,4 +1,10 @@
-"""Build a human in the scene: an armature with body mesh, and splats or volumes, as its children."""
+"""Build a human in the scene: an armature with body mesh, and splats or volumes, as its children; before Blender 5.3
+also what a Blender without the extension shows of it.
+
+That is the body mesh with a name that says what is missing. Whether viewports hide it is driven by a property that the
+extension registers on scenes; where it is not registered, the driver has its fallback value. So nothing is switched
+when files are saved and loaded, and no script runs.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +20,11 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from .armature import build_armature, floor_below
 from .convention import points_to_blender
-from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part
-from .payload import pack
+from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part, pack
+from .human_file import read_human, shape_model_of
 from .representation import set_representation
-from .rest_human import read_human, shape_model_of
 from .shape import betas_of
 from .splats import SPLATS_AVAILABLE
-from .stand_in import build_stand_in
 
 NAME_LENGTH = 40
 """Characters of a new human's name; names of its parts are longer, and Blender allows 63."""
@@ -142,3 +146,58 @@ def _by_weight(weights: NDArray) -> Iterator[tuple[list[int], float]]:
     alike = vertices.tolist()
     for start, end in itertools.pairwise([*starts, len(alike)]):
         yield alike[start:end], float(ordered[start])
+
+
+STAND_IN = "primdiffusion_stand_in"
+"""Custom property of such an object."""
+PRESENT = "primdiffusion_present"
+"""Property of scenes while the extension is enabled; its value is never set."""
+_LABEL = "needs_PrimDiffusion"
+
+PROPERTIES = (
+    (
+        bpy.types.Scene,
+        PRESENT,
+        bpy.props.BoolProperty(
+            name="PrimDiffusion", description="The extension is enabled", default=True, options={"HIDDEN"}
+        ),
+    ),
+)
+
+
+def build_stand_in(label: str, armature: bpy.types.Object, body: bpy.types.Object) -> bpy.types.Object:
+    """The object, linked to no collection: the mesh of `body` on the armature, never rendered."""
+    made = bpy.data.objects.new(f"{label}_{_LABEL}", body.data)
+    made[STAND_IN] = True
+    made.parent = armature
+    modifier = made.modifiers.new("Armature", "ARMATURE")
+    modifier.object = armature
+    modifier.use_deform_preserve_volume = False
+    made.show_name = True
+    made.hide_viewport = made.hide_render = True
+    driver = made.driver_add("hide_viewport").driver
+    driver.type = "SUM"
+    variable = driver.variables.new()
+    variable.type = "CONTEXT_PROP"
+    (target,) = variable.targets
+    target.context_property = "ACTIVE_SCENE"
+    target.data_path = PRESENT
+    target.use_fallback_value = True
+    target.fallback_value = 0.0
+    return made
+
+
+def register() -> None:
+    """Hide what stands in for humans of the open file, when the extension is enabled."""
+    _evaluate()
+
+
+def unregister() -> None:
+    """Show it again."""
+    _evaluate()
+
+
+def _evaluate() -> None:
+    for obj in getattr(bpy.data, "objects", ()):  # not while Blender starts
+        if STAND_IN in obj:
+            obj.update_tag()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..formats.body_layout import LARGEST_STRETCH
 from .human import own_data, parts_of
-from .rest_human import default_body
+from .human_file import default_body
 from .shape import ShapeModel
 
 VERTEX, PRIMITIVE, FIRST = "vertex", "primitive", "first"

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from .armature import check_joints, floor_below, move_rest_joints
 from .cells import scale_cells
 from .convention import points_to_blender
-from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data
-from .payload import pack, session_file
-from .rest_human import read_human, shape_model_of
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data, pack, session_file
+from .human_file import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
 from .splats import replace_splats
 from .volume_nodes import set_folder

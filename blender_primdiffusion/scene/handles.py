@@ -7,16 +7,15 @@ the constraints: Blender's solver starts from these, and ends there as long as n
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import bpy
 import numpy as np
 from mathutils import Matrix, Quaternion, Vector
 
-from .actions import action_curves, frames_in_use, loops, own_curves, repeat
+from .actions import action_curves, frames_in_use, loops, own_curves, posed_on, repeat
 from .armature import CONTROLS, LIMBS, POLE_M, Limb, editing_bones, place_controls, rest_rotations
-from .export_model import scene_with_only
 
 COLLECTION = "IK Handles"
 """Of bones: handles and poles."""
@@ -52,7 +51,7 @@ def add_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None:
     check_no_handles(armature)
     rest_rotations(armature)
     frames = frames_in_use(armature)
-    poses = [_joints(shown) for shown in _shown_on(context, armature, frames)]
+    poses = [_joints(shown) for shown in posed_on(context, armature, frames or [context.scene.frame_current])]
     with editing_bones(_own_bones(armature)) as bones:
         for limb in LIMBS:
             for name in limb.controls:
@@ -74,7 +73,7 @@ def bake_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None
     if not has_handles(armature):
         raise ValueError(f"{armature.name!r} has no IK handles: press Add IK Handles first")
     frames = frames_in_use(armature)
-    poses = [_turns(shown) for shown in _shown_on(context, armature, frames)]
+    poses = [_turns(shown) for shown in posed_on(context, armature, frames or [context.scene.frame_current])]
     data = _own_bones(armature)
     with editing_bones(data) as bones:
         for name in CONTROLS:
@@ -148,17 +147,6 @@ def _constrain(armature: bpy.types.Object, limb: Limb) -> None:
 def _bend_axis(armature: bpy.types.Object, limb: Limb) -> Vector:
     """See `Limb.bend_axis`."""
     return Vector(limb.bend_axis(np.array(armature.data.bones[limb.root].matrix_local.to_3x3())))
-
-
-def _shown_on(context: bpy.types.Context, armature: bpy.types.Object, frames: range) -> Iterator[bpy.types.Object]:
-    """The evaluated armature on each frame; where there are none, as it is shown now."""
-    if not frames and armature.visible_get() and armature.data.pose_position == "POSE":
-        yield armature.evaluated_get(context.evaluated_depsgraph_get())
-        return
-    with scene_with_only(context, armature) as scene:
-        for frame in frames or (scene.frame_current,):
-            scene.frame_set(frame)
-            yield armature.evaluated_get(scene.view_layers[0].depsgraph)
 
 
 def _joints(shown: bpy.types.Object) -> dict[str, Matrix]:

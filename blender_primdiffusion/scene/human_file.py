@@ -1,4 +1,5 @@
-""".human files: a human as the backend saves it (safetensors), with its current shape and its motion.
+""".human files: a human as the backend saves it (safetensors), with its current shape and its motion; and what a file
+holds, a human at rest on its body: the default one, or the one in a file beside it.
 
 The backend reads them as it reads its own files; the motion is stored under additional names (`motion.*`). Both find
 tensors in a file by `files.tensor_layout`; numpy is enough to read and write them.
@@ -11,26 +12,32 @@ import functools
 import io
 import json
 from pathlib import Path
+from typing import Any
 
+import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.arrays import all_finite, check_shapes
+from ..files.arrays import MOST_BODY_VALUES, all_finite, check_shapes, read_arrays
 from ..files.json_files import parse_json
-from ..files.regular_files import FileError, as_file_error, read_regular
+from ..files.regular_files import FileError, as_file_error, exists_in_its_folder, read_regular
 from ..files.tensor_layout import DTYPES, LENGTH_BYTES, read_layout
 from ..files.whole_files import written_whole
+from ..formats.body_layout import body_data, half_extents, stencils
+from ..formats.body_layout import read_layout as read_body_layout
 from ..formats.human_layout import (
     COMPACT_SCALES,
     COMPACT_VERSION,
     LARGEST_VALUE,
     from_eight_bits,
+    provenance_of,
     to_eight_bits,
     version_fault,
 )
 from ..formats.poses.rotation import first_improper, improper_text
-from .human import BETA_COUNT
-from .payload import LARGEST_PERSON
+from .human import BETA_COUNT, BODY_FILE, LARGEST_BETA, LARGEST_PERSON, session_file
+from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
+from .volumes import Grids, bake
 
 _METADATA = "__metadata__"
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
@@ -105,21 +112,6 @@ class HumanPayload:
     """[K, 3], metres; None on the default body."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FileVersion:
-    """A file as it is now; another one when it is written again."""
-
-    path: Path
-    modified: int
-    size: int
-
-
-def file_version(path: Path) -> FileVersion:
-    """Raises OSError."""
-    found = path.stat()
-    return FileVersion(path, found.st_mtime_ns, found.st_size)
-
-
 def read_payload(path: Path) -> HumanPayload:
     """Read what is drawn of a .human file. Raises ValueError for a damaged file or a newer one, OSError."""
     return payload_in(read_tensors(path), path.name)
@@ -146,9 +138,9 @@ def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> 
 
 
 @functools.lru_cache(maxsize=64)
-def read_sizes(version: FileVersion) -> HumanPayload:
-    """As `read_payload`, without colours and densities (empty arrays); cached."""
-    payload, nothing = read_payload(version.path), np.empty(0, np.float32)
+def read_sizes(path: Path) -> HumanPayload:
+    """As `read_payload`, without colours and densities (empty arrays); cached, since a `session_file` never changes."""
+    payload, nothing = read_payload(path), np.empty(0, np.float32)
     extents = payload.rest_half_extent
     return dataclasses.replace(
         payload,
@@ -257,3 +249,119 @@ def _loaded(dtype: str, shape: tuple[int, ...], raw: bytes | memoryview) -> NDAr
     """An array as a view of its bytes; of bfloat16, which numpy does not have, as float32."""
     array = np.frombuffer(raw, DTYPES[dtype]).reshape(shape)
     return (array.astype("<u4") << 16).view("<f4") if dtype == "BF16" else array
+
+
+def shape_model_of(person: bpy.types.Object) -> ShapeModel:
+    """The model by which the human's body follows its shape. Raises as `session_file` and `session_body`."""
+    return session_body(session_file(person))
+
+
+def session_body(person: Path) -> ShapeModel:
+    """The body of the human in a `session_file`, which never changes: cached. Raises as `body_beside`."""
+    return default_body() if read_sizes(person).rest_half_extent is None else _session_body(person)
+
+
+@functools.lru_cache(maxsize=4)
+def _session_body(person: Path) -> ShapeModel:
+    return body_beside(person, read_sizes(person))
+
+
+def body_beside(person: Path, payload: HumanPayload) -> ShapeModel:
+    """The body of the human in a file: the default one, or that of BODY_FILE beside it.
+
+    Raises FileNotFoundError where BODY_FILE is missing, ValueError for a damaged file, OSError.
+    """
+    if payload.rest_half_extent is None:
+        return default_body()
+    path = person.with_name(BODY_FILE)
+    if not exists_in_its_folder(path):
+        raise FileNotFoundError(
+            f"the body's file is missing: {str(path)!r}; put it back beside the human's file, or generate the human "
+            "again"
+        )
+    with as_file_error(path, "is not a body or is damaged", "generate the human again"):
+        arrays = body_arrays(path)
+        if sum(values.size for values in arrays.values()) > MOST_BODY_VALUES:
+            raise ValueError(f"it holds more than {MOST_BODY_VALUES} values")
+        given = {name: shape for name, shape in OPTIONAL_FIELDS.items() if name in arrays}
+        check_shapes(path.name, arrays, FIELDS | given, {})
+        model = ShapeModel.from_arrays(arrays)
+        if fault := faulty_field(model):
+            raise ValueError(f"the field {fault!r} holds impossible values")
+    return model
+
+
+@functools.cache
+def default_body() -> ShapeModel:
+    """The body that comes with the extension; made in a tenth of a second, once."""
+    keys = ("v_template", "shapedirs", "J_regressor", "weights", "f", "vt", "ft")
+    stored, layout = read_arrays(body_data("body.npz"), keys), read_body_layout(body_data("layout.npz"))
+    template, basis, faces = stored["v_template"], stored["shapedirs"], stored["f"].astype(np.int32)
+    vertex, du, dv = stencils(faces, layout["texel_face"], layout["texel_barycentric"])
+    support, regressor = template.astype(np.float64)[vertex], stored["J_regressor"].astype(np.float64)
+    planes = (np.einsum("km,kmx->kx", weight, support) for weight in (du, dv))
+    return ShapeModel.from_arrays(
+        {
+            "template": template,
+            "shape_basis": basis,
+            "joint_template": regressor @ template,
+            "joint_basis": np.einsum("jv,vcn->jcn", regressor, basis, optimize=True),
+            "faces": faces,
+            "face": layout["cell_face"],
+            "barycentric": layout["cell_barycentric"],
+            "stencil_vertex": vertex,
+            "stencil_du": du,
+            "stencil_dv": dv,
+            "skin_weights": stored["weights"],
+            "rest_half_extent": half_extents(*planes, layout["cell_chart"]),
+            "uv_corner": stored["vt"][stored["ft"]],
+        }
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RestHuman:
+    """A human at rest, in the backend's axes (y up, metres); `convention` turns them into Blender's."""
+
+    made: dict[str, Any]
+    """Provenance: seed, steps, checkpoint, full_density, version."""
+    payload: HumanPayload
+    model: ShapeModel
+    rest: Rest
+    """The model at the payload's betas."""
+
+    def grids(self) -> Grids:
+        """The voxels of its volumes."""
+        half_extent = self.rest_half_extent * self.payload.delta_scale
+        return bake(self.payload.density, np.moveaxis(self.payload.rgb, 1, -1), half_extent)
+
+    @property
+    def rest_half_extent(self) -> NDArray[np.float64]:
+        """Half sides of the boxes before their delta scale [K, 3], metres."""
+        own = self.payload.rest_half_extent
+        return np.asarray(self.model.rest_half_extent if own is None else own, np.float64)
+
+    def provenance(self) -> str:
+        """JSON for the custom property `human.MARK`."""
+        return json.dumps({**self.made, "betas": np.round(self.payload.betas.astype(np.float64), 6).tolist()})
+
+
+def read_human(person: Path, remedy: str = GENERATE_AGAIN) -> RestHuman:
+    """Read a human and its body; `remedy` says what to do about a damaged file.
+
+    Raises FileNotFoundError where a file is missing, ValueError for a damaged one, a newer one and one on another body,
+    OSError.
+    """
+    if not person.is_file():
+        raise FileNotFoundError(f"there is no human file at {str(person)!r}; generate the human again")
+    tensors = read_tensors(person, remedy)
+    payload = payload_in(tensors, person.name, remedy)
+    if np.abs(payload.betas).max() > LARGEST_BETA:
+        raise FileError(person, f"has betas above {LARGEST_BETA}", remedy)
+    with as_file_error(person, "is damaged", remedy):
+        made = provenance_of(tensors.metadata)
+    model = body_beside(person, payload)
+    if len(payload.density) != len(model.face):
+        reason = f"holds {len(payload.density)} primitives instead of its body's {len(model.face)}"
+        raise FileError(person, reason, remedy)
+    return RestHuman(made, payload, model, model.rest(payload.betas.astype(np.float64)))

@@ -17,8 +17,7 @@ from ..files.arrays import all_finite, check_shapes, read_arrays
 from ..files.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
 from ..files.whole_files import written_whole
 from .blend_values import stored_record
-from .human import link_part, parts_of, write_error
-from .payload import session_folder, state_of
+from .human import link_part, parts_of, session_folder, state_of, write_error
 from .volume_nodes import volume_material
 from .volumes import write_vdb
 

@@ -1,4 +1,9 @@
-"""The mesh proxy: a human's clothed surface, textured, skinned to the armature."""
+"""The mesh proxy: a human's clothed surface, textured, skinned to the armature; and its export to other programs.
+
+Blender's own exporters write a temporary scene that holds nothing but armature and proxy, so the user's selection,
+modes and visibility stay as they are. Bones that deform nothing (IK handles) are left out, and their effect is in the
+joints.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +11,26 @@ import dataclasses
 import json
 import shutil
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import addon_utils
 import bpy
 import numpy as np
 from mathutils import Color
 from numpy.typing import NDArray
 
 from ..files.arrays import all_finite, check_shapes, read_arrays
-from ..files.regular_files import FileError, as_file_error, portable_name
+from ..files.regular_files import FileError, as_file_error, portable_name, remove_folder
+from ..files.whole_files import replacing
 from ..formats.joints import JOINT_NAMES
-from .armature import model_origin
+from .actions import scene_with_only
+from .armature import check_joints, model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, PROXY_MARK
-from .payload import state_of
+from .human import BETA_COUNT, BODY_MARK, PROXY_MARK, state_of
 from .shape import betas_of
 
 _FORMAT_VERSION = 1
@@ -122,3 +131,134 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
     shader.inputs["Roughness"].default_value = 0.9
     shader.inputs["Metallic"].default_value = 0.0
     return material
+
+
+def write_model(
+    context: bpy.types.Context,
+    armature: bpy.types.Object,
+    mesh: bpy.types.Object,
+    path: Path,
+    kind: str,
+    frames: range,
+) -> None:
+    """Write a file of `kind` (GLB, FBX or USD), which appears whole or not at all; one frame is a pose.
+
+    USD's textures go into a folder beside the file, except in .usdz. Raises ValueError or RuntimeError where an
+    exporter is missing or fails, and OSError.
+    """
+    check_joints(armature)
+    folder = Path(tempfile.mkdtemp(prefix="export_", dir=bpy.app.tempdir or None))
+    try:
+        with _selected_in_scene(context, armature, mesh, frames) as overrides, context.temp_override(**overrides):
+            _EXPORTERS[kind](folder / path.name, frames)
+        if not (folder / path.name).is_file():
+            raise RuntimeError(f"Blender's exporter wrote no {kind} file: see the console")
+        _publish(folder, path)
+    finally:
+        remove_folder(folder, folder.parent)
+
+
+@contextmanager
+def _selected_in_scene(
+    context: bpy.types.Context, armature: bpy.types.Object, mesh: bpy.types.Object, frames: range
+) -> Iterator[dict[str, object]]:
+    """Context overrides for a temporary scene in which the armature and the mesh are selected."""
+    with scene_with_only(context, armature) as scene:
+        scene.frame_start, scene.frame_end = frames[0], frames[-1]
+        scene.collection.objects.link(mesh)
+        layer = scene.view_layers[0]
+        if len(frames) > 1:
+            scene.frame_set(frames[0])
+        for obj in (armature, mesh):
+            obj.select_set(True, view_layer=layer)
+        layer.objects.active = armature
+        yield {
+            "scene": scene, "view_layer": layer, "active_object": armature, "object": armature,
+            "selected_objects": [armature, mesh], "collection": scene.collection,
+        }  # fmt: skip
+
+
+def _write_glb(path: Path, frames: range) -> None:
+    with _enabled("io_scene_gltf2", "glTF"):
+        _run(
+            bpy.ops.export_scene.gltf,
+            filepath=str(path),
+            export_format="GLB",
+            use_selection=True,
+            use_active_scene=True,
+            export_image_format="AUTO",
+            export_animations=len(frames) > 1,
+            export_animation_mode="SCENE",
+            export_anim_scene_split_object=False,
+            export_frame_range=True,
+            export_rest_position_armature=len(frames) > 1,
+            export_current_frame=True,
+            export_influence_nb=4,
+            export_def_bones=True,
+            export_extras=False,
+        )
+
+
+def _write_fbx(path: Path, frames: range) -> None:
+    with _enabled("io_scene_fbx", "FBX"):
+        _run(
+            bpy.ops.export_scene.fbx,
+            filepath=str(path),
+            use_selection=True,
+            object_types={"ARMATURE", "MESH"},
+            add_leaf_bones=False,
+            use_armature_deform_only=True,
+            mesh_smooth_type="FACE",
+            path_mode="COPY",
+            embed_textures=True,
+            bake_anim=True,  # of one frame, too: that is how FBX holds a pose
+            bake_anim_use_all_actions=False,
+            bake_anim_use_nla_strips=False,
+            bake_anim_simplify_factor=0.0,
+        )
+
+
+def _write_usd(path: Path, frames: range) -> None:
+    if not bpy.app.build_options.usd:
+        raise ValueError("this Blender was built without USD: choose glTF or FBX")
+    _run(
+        bpy.ops.wm.usd_export,
+        filepath=str(path),
+        selected_objects_only=True,
+        export_animation=len(frames) > 1,
+        export_armatures=True,
+        only_deform_bones=True,
+        export_textures_mode="NEW",
+        export_materials=True,
+    )
+
+
+_EXPORTERS: dict[str, Callable[[Path, range], None]] = {"GLB": _write_glb, "FBX": _write_fbx, "USD": _write_usd}
+
+
+@contextmanager
+def _enabled(module: str, label: str) -> Iterator[None]:
+    """Enable Blender's own add-on `module` for the block where the user has disabled it."""
+    _, loaded = addon_utils.check(module)
+    if not loaded and addon_utils.enable(module, default_set=False) is None:
+        raise ValueError(f"Blender's {label} add-on {module!r} cannot be enabled: choose another format")
+    try:
+        yield
+    finally:
+        if not loaded:
+            addon_utils.disable(module, default_set=False)
+
+
+def _run(exporter: Callable[..., set[str]], **settings: object) -> None:
+    """Run an operator; raises RuntimeError, with Blender's own message, where it fails."""
+    if exporter(**settings) != {"FINISHED"}:
+        raise RuntimeError("Blender's exporter was cancelled: see the console")
+
+
+def _publish(folder: Path, path: Path) -> None:
+    """Copy the written files to their destination, the main file last. Raises OSError."""
+    for source in sorted(folder.rglob("*"), key=lambda source: source == folder / path.name):
+        if source.is_dir():
+            continue
+        with replacing(path.parent / source.relative_to(folder), path.parent) as unfinished:
+            shutil.copyfile(source, unfinished)

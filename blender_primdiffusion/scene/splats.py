@@ -1,7 +1,7 @@
 """A human as Gaussian splats, which Blender 5.3 and newer draw in every mode and engine: one for each visible voxel.
 
 The splats are one point cloud, a child of the armature. Each has a place in its cell, the frame of a primitive; the
-node group of `splat_nodes` takes the cells from the skinned body, so that Blender's own skinning moves the splats.
+node group, one for all humans, takes the cells from the skinned body, so that Blender's own skinning moves the splats.
 """
 
 from __future__ import annotations
@@ -12,12 +12,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import add_nodes, cell_mesh
-from .human import body_of, link_part, own_data, parts_of
-from .payload import session_file
-from .rest_human import RestHuman, read_human
+from .cells import NodeGroup, add_nodes, cell_mesh, shared_group
+from .human import body_of, link_part, own_data, parts_of, session_file
+from .human_file import RestHuman, read_human
 from .shape import betas_of, generated_betas
-from .splat_nodes import BODY, C0, CELL, CELLS, splat_group
 from .volumes import WINDOW_EXPONENT
 
 SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
@@ -169,3 +167,99 @@ def replace_splats(person: bpy.types.Object, human: RestHuman) -> None:
         return
     for part in filter(None, (splats, cells)):
         bpy.data.objects.remove(part)
+
+
+GROUP_NAME = "PrimDiffusion Splats on Body"
+CELL = "cell"
+"""Attribute of splats: the index of their primitive. Their `position` is in its axes T, B, N, metres."""
+BODY, CELLS = "Body", "Cells"
+SIZE, DETAIL, SHADING, SUN = "Size", "Detail", "Shading", "Sun"
+"""Inputs of the group."""
+C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+_IN_SHADOW = 0.3
+"""Share of the light that reaches skin which is turned away from the sun."""
+_GAMMA = 2.2
+
+
+def splat_group() -> bpy.types.NodeTree:
+    """The shared node group, made on first use."""
+    return shared_group(GROUP_NAME) or _build(NodeGroup(GROUP_NAME, "Moves the splats of a human with its body"))
+
+
+def _build(group: NodeGroup) -> bpy.types.NodeTree:
+    group.socket("Splats", "INPUT", "NodeSocketGeometry")
+    group.socket(BODY, "INPUT", "NodeSocketObject", "The human's body mesh, which its armature bends")
+    group.socket(CELLS, "INPUT", "NodeSocketObject", "How each box of the human lies on the body mesh")
+    group.socket("Splats", "OUTPUT", "NodeSocketGeometry")
+    for name, most, description in (
+        (DETAIL, 1.0, "Share of the splats that is drawn, larger ones where it is less: 0.12 for crowds"),
+        (SIZE, 10.0, "Factor on the size of every splat"),
+    ):
+        item = group.socket(name, "INPUT", "NodeSocketFloat", description)
+        item.default_value, item.min_value, item.max_value = 1.0, 0.01, most
+    item = group.socket(SHADING, "INPUT", "NodeSocketFloat", "How much the sun shades the human; 0: as generated")
+    item.subtype, item.min_value, item.max_value = "FACTOR", 0.0, 1.0
+    group.socket(SUN, "INPUT", "NodeSocketObject", "A sun lamp; without one the light comes from above")
+    node, vector, scalar = group.node, group.vector, group.scalar
+    inputs = node("NodeGroupInput").outputs
+    body, cells = group.geometry_of(inputs[BODY]), group.geometry_of(inputs[CELLS])
+    centre, rotation, growth = group.frames(body)
+    cell = group.attribute(CELL, "INT")
+
+    def of_cell(value: bpy.types.NodeSocket, kind: str) -> bpy.types.NodeSocket:
+        return node(
+            "GeometryNodeSampleIndex",
+            {"Geometry": cells, "Value": value, "Index": cell},
+            data_type=kind,
+            domain="POINT",
+        ).outputs["Value"]
+
+    turn, size = of_cell(rotation, "QUATERNION"), of_cell(growth, "FLOAT_VECTOR")
+    position = node("GeometryNodeInputPosition").outputs[0]
+    offset = node("FunctionNodeRotateVector", {0: vector("MULTIPLY", position, size), 1: turn}).outputs[0]
+    place = vector("ADD", of_cell(centre, "FLOAT_VECTOR"), offset)
+
+    def stored(points: bpy.types.NodeSocket, name: str, kind: str, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return node(
+            "GeometryNodeStoreNamedAttribute",
+            {"Geometry": points, "Name": name, "Value": value},
+            data_type=kind,
+            domain="POINT",
+        ).outputs["Geometry"]
+
+    # the first splats are those of the coarser lattices: see `splats.splats_of`
+    whole, detail = inputs["Splats"], inputs[DETAIL]
+    count = node("GeometryNodeAttributeDomainSize", {"Geometry": whole}, component="POINTCLOUD").outputs["Point Count"]
+    left_out = node(
+        "FunctionNodeCompare",
+        {"A": node("GeometryNodeInputIndex").outputs[0], "B": scalar("MULTIPLY", count, detail)},
+        data_type="FLOAT",
+        operation="GREATER_EQUAL",
+    ).outputs["Result"]
+    points = node("GeometryNodeDeleteGeometry", {"Geometry": whole, "Selection": left_out}, domain="POINT")
+    points = stored(points.outputs["Geometry"], "rotation", "QUATERNION", turn)
+    larger = scalar("MULTIPLY", inputs[SIZE], scalar("POWER", detail, -1 / 3))
+    scale = node(
+        "ShaderNodeVectorMath",
+        {0: vector("MULTIPLY", group.attribute("scale", "FLOAT_VECTOR"), size), "Scale": larger},
+        operation="SCALE",
+    ).outputs[0]
+    points = stored(points, "scale", "FLOAT_VECTOR", scale)
+    up = (0.0, 0.0, 1.0)
+    sun = node("GeometryNodeObjectInfo", {"Object": inputs[SUN]}, transform_space="RELATIVE").outputs["Rotation"]
+    to_sun, normal = (node("FunctionNodeRotateVector", {0: up, 1: by}).outputs[0] for by in (sun, turn))
+    lit = scalar("MAXIMUM", vector("DOT_PRODUCT", normal, to_sun), 0.0)
+    dimmed = scalar("MULTIPLY", scalar("SUBTRACT", 1.0, lit), scalar("MULTIPLY", inputs[SHADING], 1 - _IN_SHADOW))
+    factor = scalar("POWER", scalar("SUBTRACT", 1.0, dimmed), 1 / _GAMMA)  # of encoded colours
+    radiance = group.attribute("radiance:base", "FLOAT_COLOR")
+    encoded = vector("MULTIPLY_ADD", radiance, (C0,) * 3, (0.5,) * 3)
+    shaded = node("ShaderNodeVectorMath", {0: encoded, "Scale": factor}, operation="SCALE").outputs[0]
+    channels = node("ShaderNodeSeparateXYZ", {0: vector("MULTIPLY_ADD", shaded, (1 / C0,) * 3, (-0.5 / C0,) * 3)})
+    colour = dict(zip(("Red", "Green", "Blue"), channels.outputs, strict=True))
+    opacity = node("FunctionNodeSeparateColor", {0: radiance}).outputs["Alpha"]
+    shown = node("FunctionNodeCombineColor", {**colour, "Alpha": opacity}).outputs[0]
+    points = stored(points, "radiance:base", "FLOAT_COLOR", shown)
+    points = node("GeometryNodeSetPosition", {"Geometry": points, "Position": place}).outputs["Geometry"]
+    group.put(node("NodeGroupOutput").inputs["Splats"], points)
+    return group.tree

@@ -1,18 +1,26 @@
-"""The volumes of a human as one object, whose node group shows a VDB file for each primitive on the skinned body; and
-their material: emission and absorption driven by the density grid, times a gain."""
+"""The volumes of a human as one object, whose node group shows a VDB file for each primitive on the skinned body; their
+material: emission and absorption driven by the density grid, times a gain; Cycles' settings for them; and the files, a
+bake that may be deleted.
+
+The files lie beside the human's own file in the temporary folder of this session (see `payload`). A .blend that comes
+from another session, or from a stranger, names folders of its own: `open_humans` names this session's before anything
+is read.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 
+from ..files.whole_files import remove_abandoned
 from ..formats.requests import DENSITY_GAIN
 from .cells import FIRST, PRIMITIVE, NodeGroup, add_nodes, cell_mesh, set_input, shared_group
-from .human import body_of, link_part, parts_of
-from .payload import session_file
-from .rest_human import shape_model_of
+from .human import all_humans, body_of, link_part, parts_of, session_file, write_error
+from .human_file import read_human, shape_model_of
 from .shape import betas_of, generated_betas
+from .volumes import write_volume
 
 VOLUMES_MARK = "primdiffusion_volumes"
 """Custom property of the object of a human that shows its volumes."""
@@ -169,3 +177,78 @@ def density_gain() -> bpy.types.NodeSocketFloat | None:
     tree = material.node_tree if material is not None else None
     node = tree.nodes.get(GAIN_NODE) if tree is not None else None
     return node.outputs[0] if node is not None and node.outputs else None
+
+
+def open_humans() -> list[str]:
+    """Point the volumes of all humans to the files of this session; returns what is wrong with humans, in sentences.
+
+    For files that were opened and humans that were appended or linked, before undo takes note of them. A human whose
+    data are missing or damaged shows its body mesh. Viewports hide volumes whose files are yet to be written: Blender
+    would remember that they were missing (see `set_folder`).
+    """
+    faults = []
+    for person in all_humans():
+        try:
+            folder = session_file(person).parent
+            shape_model_of(person)
+        except (ValueError, OSError) as error:
+            faults.append(f"the human {person.name!r} cannot be drawn: {error}")
+            if (body := body_of(person)) is not None:
+                body.hide_viewport = False
+            continue
+        set_folder(person, folder)
+        volumes = volumes_of(person)
+        if volumes is not None and not volumes.hide_viewport and not are_written(person):
+            hide_in_viewport(person, volumes)
+    return faults
+
+
+def files_of(person: bpy.types.Object) -> list[Path]:
+    """Where the files of a human's volumes are, or will be. Raises as `session_file` and `shape_model_of`."""
+    folder, count = session_file(person).parent, len(shape_model_of(person).face)
+    return [folder / FILES.format(k) for k in range(count)]
+
+
+def are_written(person: bpy.types.Object) -> bool:
+    """Whether all files of a human's volumes are there. Raises as `files_of`."""
+    return all(path.is_file() for path in files_of(person))
+
+
+def writing(person: bpy.types.Object) -> Generator[None, None, None]:
+    """Write the files of a human's volumes, one a step; those that are there stay. It holds no Blender objects, since
+    undo may replace them. Raises as `read_human`, also for what cannot be written.
+    """
+    return _writing(session_file(person), files_of(person))
+
+
+def _writing(source: Path, files: list[Path]) -> Generator[None, None, None]:
+    grids = read_human(source).grids()
+    yield
+    remove_abandoned(source.parent)
+    for k, path in enumerate(files):
+        try:
+            if not path.is_file():
+                write_volume(grids, k, path)
+        except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
+            raise write_error(source.parent, error) from error
+        yield
+
+
+def write_volumes(person: bpy.types.Object) -> None:
+    """Write the files of a human's volumes, which takes seconds. Raises as `writing`."""
+    if volumes_of(person) is not None and not are_written(person):
+        for _ in writing(person):
+            pass
+
+
+def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
+    """Set Cycles up so that a human takes minutes, not hours: other objects lose indirect light."""
+    cycles = scene.cycles
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.max_bounces = 0
+    cycles.volume_bounces = 0
+    cycles.transparent_max_bounces = 1024  # every box in a row costs two
+    cycles.volume_step_rate = 1.0
+    cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame

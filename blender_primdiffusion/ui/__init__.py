@@ -13,7 +13,7 @@ from types import ModuleType
 import bpy
 
 from ..jobs import follow, parts, volumes, windows
-from ..scene import stand_in
+from ..scene import build
 from . import (
     advanced_panel,
     captures_panel,
@@ -44,7 +44,7 @@ MODULES = (
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
     volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, export_panel, advanced_panel, captures_settings,
-    captures_panel, reconstruct_panel, viewport_humans, manual, menus, stand_in,
+    captures_panel, reconstruct_panel, viewport_humans, manual, menus, build,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

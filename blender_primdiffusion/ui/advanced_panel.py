@@ -7,13 +7,11 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
-from ..jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
-from ..jobs.target import HumanTarget, selected_person
-from ..jobs.volumes import VolumesJob
+from ..jobs.volumes import MergeJob, PoseSnapshot, VolumesJob
 from ..places import backend_is_named
+from ..scene.actions import posed_on
 from ..scene.blend_values import as_shown
-from ..scene.cycles import overlap_of, overlap_warning_in
-from ..scene.human import humans, provenance_of, proxy_of
+from ..scene.human import HumanTarget, humans, provenance_of, proxy_of, selected_person
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import remove_proxy
 from ..scene.representation import (
@@ -26,7 +24,7 @@ from ..scene.representation import (
     stop_showing,
 )
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
-from ..scene.volume_nodes import density_gain, volumes_of
+from ..scene.volume_nodes import density_gain
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
@@ -46,6 +44,7 @@ REPRESENTATIONS = (
 )
 _NO_MESH = ("NO_MESH", "Remove Mesh Proxy", "Delete the mesh proxy, and show what there was before")
 _MOST_FRAMES = 3_000
+_OVERLAP = "Cycles draws at most 31 volumes at a point, and humans have more in places: merge the human"
 
 
 class PRIMDIFFUSION_OT_set_representation(HumanOperator, bpy.types.Operator):
@@ -117,14 +116,15 @@ class PRIMDIFFUSION_OT_merge(HumanOperator, bpy.types.Operator):
         target, voxel = HumanTarget.of(person), context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
             moment = PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get()))
-            return submit(self, context, MergeJob(target, moment, voxel))
+            return submit(self, context, MergeJob(target, [moment], voxel))
         start, end = context.scene.frame_start, context.scene.frame_end
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
                 f"frames {start} to {end} are not a sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
-        moments = _moments(context, person, range(start, end + 1))
-        return submit(self, context, MergeFramesJob(target, moments, start, voxel))
+        shown = posed_on(context, person, range(start, end + 1))
+        moments = [PoseSnapshot.capture(person, armature) for armature in shown]
+        return submit(self, context, MergeJob(target, moments, voxel, start))
 
 
 def _unmerge(person: bpy.types.Object) -> None:
@@ -133,19 +133,6 @@ def _unmerge(person: bpy.types.Object) -> None:
         raise ValueError(f"{person.name!r} has no merged volume")
     stop_showing(person, "MERGED")
     remove_merged(person)
-
-
-def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[PoseSnapshot]:
-    """The human in each frame; the scene is at its own frame again afterwards."""
-    scene, now = context.scene, context.scene.frame_current
-    moments = []
-    try:
-        for frame in frames:
-            scene.frame_set(frame)
-            moments.append(PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get())))
-    finally:
-        scene.frame_set(now)
-    return moments
 
 
 class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
@@ -253,9 +240,8 @@ def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, pe
         draw_lines(layout, "The material PrimDiffusion Volume has no node Density Gain", "INFO")
     else:
         layout.prop(gain, "default_value", text="Density Gain")
-    warning = overlap_warning_in(context.scene, person)
-    if warning is not None:
-        draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
+    if context.scene.render.engine == "CYCLES" and representation_of(person) == "VOLUMES":
+        draw_lines(layout, _OVERLAP, "INFO")
 
 
 def _draw_facts(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
@@ -298,11 +284,6 @@ def details(person: bpy.types.Object) -> list[tuple[str, str]]:
     cloud = cloud_of(person)
     if cloud is not None:
         lines.append(("Splats", f"{len(cloud.data.points):,}"))
-    if volumes_of(person) is not None:
-        try:
-            lines.append(("Volumes", f"up to {overlap_of(person)} overlap"))
-        except ValueError:  # changed by hand
-            lines.append(("Volumes", "?"))
     return lines
 
 

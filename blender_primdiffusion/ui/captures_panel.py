@@ -22,8 +22,7 @@ from ..jobs.follow import Reporting
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
 from ..scene.convention import points_to_backend
-from .captures_session import captures, capturing
-from .captures_settings import command_args
+from .captures_settings import captures, capturing, command_args
 from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
 
 RIG = "Capture Rig"

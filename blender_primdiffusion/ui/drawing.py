@@ -9,9 +9,9 @@ import bpy
 
 from ..files.regular_files import printable
 from ..jobs.follow import blocking_activity
-from ..jobs.pictures import icons
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import error_log, remedy_for
+from ..jobs.windows import icons
 from ..places import backend_is_named
 from .manual import draw_manual_button
 

@@ -15,12 +15,10 @@ from ..formats.requests import (
     TransferRequest,
     VaryRequest,
 )
-from ..jobs.edit import EditJob
 from ..jobs.follow import Reporting, submit
-from ..jobs.target import selected_person
+from ..jobs.generate import EditJob
 from ..scene.edit import end_painting, painted_weights, start_painting
-from ..scene.human import BODY_MARK, body_of, humans
-from ..scene.payload import session_file
+from ..scene.human import BODY_MARK, body_of, humans, selected_person, session_file
 from .declared import SKIP, declared
 from .drawing import draw_job, draw_section
 from .generate_settings import (

@@ -22,8 +22,8 @@ from ..jobs.export import (
 )
 from ..jobs.follow import Reporting, submit
 from ..jobs.queue import Job
-from ..jobs.target import HumanTarget
 from ..scene.armature import check_joints
+from ..scene.human import HumanTarget
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from .declared import SKIP, declared
 from .drawing import property_columns

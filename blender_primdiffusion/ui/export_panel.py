@@ -5,11 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.assets import HumanAssetJob
+from ..jobs.export import HumanAssetJob
 from ..jobs.follow import submit
-from ..jobs.target import HumanTarget, selected_person
 from ..places import backend_is_named
-from ..scene.human import humans, proxy_of
+from ..scene.human import HumanTarget, humans, proxy_of, selected_person
 from ..scene.proxy import is_outdated
 from .advanced_panel import draw_representations
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns

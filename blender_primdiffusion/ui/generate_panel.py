@@ -7,9 +7,8 @@ from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from ..backend.requests import sentence
-from ..jobs.follow import Reporting, submit
+from ..jobs.follow import Reporting, device_line, submit
 from ..jobs.generate import GenerateJob
-from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .drawing import BackendPanel, draw_job, draw_lines, draw_section, property_columns

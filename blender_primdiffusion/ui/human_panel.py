@@ -5,9 +5,9 @@ from __future__ import annotations
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.target import selected_person
 from ..jobs.volumes import faults
 from ..places import backend_is_named
+from ..scene.human import selected_person
 from .drawing import SidebarPanel, draw_lines, draw_section
 from .edit_panel import draw_edit
 from .export_panel import draw_from_file

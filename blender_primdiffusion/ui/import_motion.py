@@ -17,9 +17,9 @@ from ..files.regular_files import FileError
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.bvh import bone_names, parse_bvh
 from ..formats.poses.files import ENDINGS, read_motion
+from ..motion.placing import Placement, extend_range, facts, place_motion
 from ..scene.human import humans
 from .drawing import draw_lines, property_columns
-from .motion_placing import Placement, extend_range, facts, place_motion
 from .on_person import ArmatureOperator, WhereTo, target_armature, warn_of_rest
 
 _MARGIN = 0.12

@@ -5,11 +5,10 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from ..jobs import follow, memory
-from ..jobs.follow import Reporting, redraw
-from ..jobs.memory import device_line
+from ..jobs import follow
+from ..jobs.follow import Reporting, device_line, redraw
 from ..jobs.queue import queue
-from .captures_session import captures
+from .captures_settings import captures
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
 from .preferences import cancel_set_up
@@ -49,7 +48,7 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
         elif self.what == "SET_UP":
             cancel_set_up()
         elif self.what == "MEMORY":
-            memory.release()
+            follow.release()
         elif not queue.cancel(self.number):
             which = f"job {self.number} is no longer queued" if self.number else "no job is running yet"
             raise ValueError(which)

@@ -12,13 +12,12 @@ from bpy_extras.io_utils import ExportHelper
 from ..backend.requests import sentence
 from ..formats.poses.files import read_motion, write_amass
 from ..formats.poses.motion import Motion
-from ..motion.adjust import rounds_of
+from ..motion.placing import FACTS, Placement, extend_range, place_motion, rounds_of, sample_motion, scene_fps
 from ..scene.actions import action_curves
 from ..scene.blend_values import as_shown, stored_record
 from .drawing import draw_lines
 from .export_operators import destination
-from .motion_placing import Placement, extend_range, place_motion, sample_motion
-from .on_person import FACTS, ArmatureOperator, WhereTo, scene_fps, target_armature
+from .on_person import ArmatureOperator, WhereTo, target_armature
 
 _MOST_FACTS = 20
 _BUILT_IN = [
@@ -78,7 +77,7 @@ class PRIMDIFFUSION_OT_export_motion(ArmatureOperator, ExportHelper, bpy.types.O
         first, last = (self.first, self.last) if self.first or self.last else (scene.frame_start, scene.frame_end)
         if last < first:
             raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
-        motion, betas, pelvis = sample_motion(context, armature, first, last)
+        motion, betas, pelvis = sample_motion(context, armature, range(first, last + 1))
         path = destination(self.filepath, (".npz",))
         write_amass(path, motion, betas, pelvis)
         self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}")

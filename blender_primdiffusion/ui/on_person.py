@@ -7,8 +7,7 @@ import bpy
 from ..formats.joints import JOINT_NAMES
 from ..jobs.follow import Reporting
 from ..jobs.parts import complete
-from ..jobs.target import named_person, selected_person
-from ..scene.human import human_of, humans
+from ..scene.human import human_of, humans, named_person, selected_person
 from .declared import SKIP
 
 
@@ -50,10 +49,6 @@ def other_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.typ
     return other
 
 
-FACTS = "primdiffusion_motion"
-"""Custom property of an action: what its motion is, as JSON."""
-
-
 def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.Object:
     """The armature of the human named, else the active armature if it has SMPL's joints, else the selected human's.
 
@@ -83,11 +78,6 @@ def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> No
         operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position")
 
 
-def scene_fps(scene: bpy.types.Scene) -> float:
-    """Frames per second, such as 23.976."""
-    return scene.render.fps / scene.render.fps_base
-
-
 class ArmatureOperator(HumanOperator):
     """Base of operators on one armature with SMPL's joints, a human's or another."""
 
@@ -103,7 +93,7 @@ class ArmatureOperator(HumanOperator):
 
 
 class WhereTo:
-    """Properties of operators that key a motion, with the values of `motion_placing.Placement`."""
+    """Properties of operators that key a motion, with the values of `motion.placing.Placement`."""
 
     start: bpy.props.IntProperty(name="Start Frame", description="Scene frame of the first pose", default=1)
     root: bpy.props.EnumProperty(

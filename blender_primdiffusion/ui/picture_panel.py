@@ -11,9 +11,8 @@ from ..capture.cameras import add_picture_camera, picture_of
 from ..jobs.follow import Reporting, submit
 from ..jobs.from_picture import FitPictureJob, PictureJob, PictureTask
 from ..jobs.parts import complete
-from ..jobs.target import HumanTarget, named_person
 from ..scene.blend_values import setting_path
-from ..scene.human import human_of
+from ..scene.human import HumanTarget, human_of, named_person
 from .declared import SKIP
 from .drawing import BackendPanel, draw_job, property_columns
 
@@ -80,10 +79,11 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
 
     bl_idname = "primdiffusion.human_from_picture"
     bl_label = "Human from Picture"
+    described_by = ("only_fit",)
 
     only_fit: bpy.props.BoolProperty(
         name="Fit Only",
-        description="Refine pose and shape of the selected human, and the camera, and make no new human",
+        description="Refine pose and shape of the selected human, and the camera, until they match the picture",
         options=SKIP,
     )
     human: bpy.props.StringProperty(
@@ -91,12 +91,6 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         description="Name of the human posed over the picture; empty: the selected one, if any",
         options=SKIP,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        if properties.only_fit:
-            return "Refine pose and shape of the selected human, and the camera, until they match the picture"
-        return cls.__doc__ or ""
 
     def act(self, context: bpy.types.Context) -> set[str]:
         complete()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..motion.posture import check_posable
+from ..motion.poses import check_posable
 from ..scene.handles import add_handles, bake_handles, has_handles
 from .drawing import draw_lines
 from .on_person import ArmatureOperator, target_armature, warn_of_rest

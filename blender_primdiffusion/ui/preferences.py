@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import importlib.util
 from typing import Literal
 
 import bpy
 
-from ..backend.client import PROGRAM
-from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, state_of, tried
+from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, own_python_has_backend, state_of
 from ..backend.requests import sentence
 from ..jobs.follow import redraw
 from ..jobs.queue import queue
@@ -39,8 +36,6 @@ class Known:
     state: Literal["named", "own Python", "ready", "outdated", "broken", "absent", "wrong"]
     line: str
     """For the panels."""
-    works: bool | None = None
-    """Whether it imported torch and the backend; None until it was tried."""
     size: int = 0
     """Bytes of the private environment."""
 
@@ -61,24 +56,18 @@ def known() -> Known:
     except BackendNotFound as error:
         return Known("wrong", sentence(error))
     if python is not None and python != folder.python:
-        return Known("named", f"Uses {python}, named by {source}", tried.get(python))
+        return Known("named", f"Uses {python}, named by {source}")
     if python is not None:
         line = f"Ready: torch {about.get('torch')}, Python {about.get('python')}, {about.get('device') or 'CPU'}"
-        works, size = tried.get(python, True), about.get("bytes", 0)
+        size = about.get("bytes", 0)
         if setup.is_outdated(about):
-            return Known("outdated", f"{line}. Made for another version of the extension: press Repair", works, size)
-        return Known("ready", line, works, size)
-    if _own_python_will_do():
-        return Known("own Python", "Uses Blender's own Python, which has torch", works=True)
+            return Known("outdated", f"{line}. Made for another version of the extension: press Repair", size)
+        return Known("ready", line, size)
+    if own_python_has_backend(bundled=setup is not None):
+        return Known("own Python", "Uses Blender's own Python, which has torch")
     if state == "broken":
         return Known("broken", "Half installed, or made by a Blender that is gone: press Repair")
     return Known("absent", "The backend is not set up yet" if setup else sentence(NOT_INSTALLED))
-
-
-@functools.cache
-def _own_python_will_do() -> bool:
-    """Whether Blender's own Python has torch, as in an environment with Blender as a module, or the whole backend."""
-    return importlib.util.find_spec("torch" if setup else PROGRAM) is not None
 
 
 def draw_set_up(layout: bpy.types.UILayout) -> bool:
@@ -119,7 +108,7 @@ def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.type
     if setup:
         setup.session.error = setup.session.notice = ""
     for kind, outcome in list(queue.outcomes.items()):
-        if outcome.error is not None and outcome.error.kind in {"environment", "timeout"}:
+        if outcome.error is not None and outcome.error.kind == "environment":
             del queue.outcomes[kind]
     redraw()
 
@@ -177,9 +166,9 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
 
 
 def _icon(now: Known) -> str:
-    if not now.usable or now.works is False:
+    if not now.usable:
         return "ERROR"
-    return "QUESTION" if now.works is None else "CHECKMARK"
+    return "FILE_SCRIPT" if now.state == "named" else "CHECKMARK"  # what others have made is tried by the first job
 
 
 def _draw_backend(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILayout) -> None:

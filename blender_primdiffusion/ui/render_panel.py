@@ -12,12 +12,12 @@ from ..backend.environment import NOT_INSTALLED
 from ..engine.engine import ENGINE
 from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
-from ..jobs.merge import MergeJob, PoseSnapshot
-from ..jobs.target import HumanTarget
+from ..jobs.volumes import MergeJob, PoseSnapshot
 from ..places import backend_is_named
-from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera, posed_extent
-from ..scene.human import human_of, humans
+from ..scene.human import HumanTarget, human_of, humans
+from ..scene.place import frame_box, humans_extent, new_camera, posed_extent
 from ..scene.representation import in_viewport, representation_of
+from ..scene.volume_nodes import fit_cycles_to_volumes
 from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
 from .preferences import draw_set_up, known
 
@@ -141,7 +141,7 @@ def _merge_all(operator: bpy.types.Operator, context: bpy.types.Context) -> set[
     """Merge the humans that volumes show: Cycles then renders them in seconds. Those that move keep their volumes."""
     graph, voxel = context.evaluated_depsgraph_get(), context.scene.primdiffusion_merging.voxel
     jobs = [
-        MergeJob(HumanTarget.of(person), PoseSnapshot.capture(person, person.evaluated_get(graph)), voxel)
+        MergeJob(HumanTarget.of(person), [PoseSnapshot.capture(person, person.evaluated_get(graph))], voxel)
         for person in humans(context.scene)
         if representation_of(person) == "VOLUMES" and not (person.animation_data and person.animation_data.action)
     ]
@@ -160,6 +160,7 @@ class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene
         person = human_of(context.view_layer.objects.active)
+        context.view_layer.update()
         extent = humans_extent(scene) if person is None else posed_extent(person)
         camera = new_camera(scene)
         camera.name = camera.data.name = "Human Camera"

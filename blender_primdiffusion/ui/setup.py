@@ -16,9 +16,8 @@ from ..backend.environment import state_of
 from ..backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
 from ..backend.requests import Steps, sentence
 from ..engine import drawing_child
-from ..jobs.follow import Reporting
+from ..jobs.follow import Reporting, Session
 from ..jobs.queue import queue
-from ..jobs.steps import Session
 from ..places import EXTENSION, backend_module_path, cache_folder, set_up_folder
 from .declared import SKIP
 from .drawing import draw_lines

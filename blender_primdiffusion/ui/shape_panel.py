@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..files.regular_files import printable
-from ..jobs.target import selected_person
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.edit import check_shapeable, reshape
-from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human
-from ..scene.rest_human import shape_model_of
+from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human, selected_person
+from ..scene.human_file import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
 from .drawing import draw_lines, draw_section, property_columns
@@ -166,6 +165,7 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
     bl_options = {"REGISTER", "UNDO"}  # fast enough to be redone with other settings
+    described_by = ("to",)
 
     to: bpy.props.EnumProperty(name="Reshape To", description="Which shape", items=_SHAPES, options=SKIP)
     betas: bpy.props.FloatVectorProperty(
@@ -184,12 +184,6 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
         min=0.0,
         max=2.0,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        if properties.to == "GIVEN":
-            return str(cls.__doc__)
-        return next(text for name, _, text in _SHAPES if name == properties.to)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.to == "RANDOM" and not self.given("seed"):

@@ -12,11 +12,10 @@ from bpy.app.handlers import persistent
 from ..backend.requests import sentence
 from ..formats.requests import VariationsRequest
 from ..jobs.follow import Reporting, redraw, submit
-from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
+from ..jobs.windows import icons
 from ..scene.build import build_human
-from ..scene.cycles import overlap_warning_in
 from ..scene.place import stand_at_cursor
 from .declared import SKIP, declared
 from .drawing import draw_job, row_unless
@@ -148,9 +147,6 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
         if failure:
             self.report({"ERROR"}, f"{len(built)} of {len(wanted)} humans were built. {failure}")
             return {"FINISHED"} if built else {"CANCELLED"}
-        for person in built:
-            if warning := overlap_warning_in(context.scene, person):
-                self.report({"WARNING"}, sentence(warning))
         return {"FINISHED"}
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import bpy
 
-from blender_primdiffusion.motion.adjust import leg_ratio
-from blender_primdiffusion.motion.posture import rest_joints
+from blender_primdiffusion.motion.placing import leg_ratio
+from blender_primdiffusion.motion.poses import rest_joints
 
 from ..bake_poses.motions import CYCLE_SECONDS, STRIDE
 from .shrink import save_gif

@@ -170,7 +170,7 @@ def cancelled_captures(module: str, python: str) -> Steps:
     yield from show("PRIMDIFFUSION_PT_captures")
     settings = bpy.context.scene.primdiffusion_captures
     settings.people, settings.out = str(folder / "people"), str(folder / "captures")
-    captures = import_module(f"{module}.ui.captures_session").captures
+    captures = import_module(f"{module}.ui.captures_settings").captures
     press("primdiffusion.render_captures", "EXEC_DEFAULT", options="--size 128 128")
 
     def pictures() -> int:

@@ -85,7 +85,7 @@ class Round:
 
     def _import(self) -> None:
         """Ask for a human, which changes nothing yet."""
-        file = import_module(f"{self.module}.scene.payload").session_file(armatures()[0])
+        file = import_module(f"{self.module}.scene.human").session_file(armatures()[0])
         press("primdiffusion.import_human", "EXEC_DEFAULT", filepath=str(file))
         self.asked = self.steps
 

@@ -7,7 +7,7 @@ from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import about_axis, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import joint_positions
 
-from blender_primdiffusion.motion.posture import current_pose, rest_joints
+from blender_primdiffusion.motion.poses import current_pose, rest_joints
 
 
 def write_amass(path, frames=31, fps=120.0, **changes):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 from blender_primdiffusion import places
 from blender_primdiffusion.backend.client import BackendClient
-from blender_primdiffusion.backend.environment import BackendPython
 
 ORDERS = "FAKE_"
 """Beginning of the variables that tell the fake child what to do; the extension itself passes none of them on."""
@@ -25,13 +23,8 @@ def fake_client(python: Path, module_path: Path | None, *, cache_dir: Path | Non
 
 def use_this_python(patch: pytest.MonkeyPatch, backend: Path | None = None) -> None:
     """The child runs on this interpreter; `backend` holds the package that it imports, by default the real one."""
-    version = "0-fake" if backend else "0"
-
-    def search(*_: object, **__: object) -> Generator[None, None, BackendPython]:
-        yield
-        return BackendPython(Path(sys.executable), "the test", version, "0", "3")
-
-    patch.setattr("blender_primdiffusion.backend.environment.search", search)
+    found = ("the test", Path(sys.executable))
+    patch.setattr("blender_primdiffusion.backend.environment.find_python", lambda *_: found)
     if backend:
         patch.setattr(places, "backend_module_path", lambda: backend)
         patch.setattr(places, "BackendClient", fake_client)

@@ -25,15 +25,25 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
+from blender_primdiffusion.motion.placing import FACTS
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, stand_in, volume_nodes
-from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, volume_nodes
+from blender_primdiffusion.scene.build import STAND_IN, build_human
 from blender_primdiffusion.scene.edit import replace_person
-from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
-from blender_primdiffusion.scene.payload import BODY, PAYLOAD
-from blender_primdiffusion.scene.volume_files import open_humans, write_volumes
+from blender_primdiffusion.scene.human import (
+    BETAS,
+    BODY,
+    BODY_MARK,
+    MARK,
+    ORIGIN,
+    PAYLOAD,
+    body_of,
+    is_human,
+    link_part,
+    parts_of,
+)
+from blender_primdiffusion.scene.volume_nodes import open_humans, write_volumes
 from blender_primdiffusion.ui.drawing import DATA
-from blender_primdiffusion.ui.on_person import FACTS
 
 COUNT = 3
 """Volumes of the human."""
@@ -138,7 +148,7 @@ HOLDERS: dict[str, Callable[[], Any]] = {
     volume_nodes.VOLUMES_MARK: _with(volume_nodes.VOLUMES_MARK),
     splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
     splats.CELLS_MARK: _with(splats.CELLS_MARK),
-    stand_in.STAND_IN: _with(stand_in.STAND_IN),
+    STAND_IN: _with(STAND_IN),
     FACTS: lambda: bpy.data.actions["Walk"],
 }
 """What holds each custom property."""
@@ -222,7 +232,7 @@ TEXT_ONLY = {"volumes.folder", "merged.filepath", "library.filepath", "armature.
 """Blender itself stores these as text."""
 ODD_RECORD = {
     "betas": "x", "edits": [1, {"edit": {}}, {"a\ud800": "\ud800"}], "attributes": [1], "seed": {"a": 1}, "steps": "\0",
-    "most_overlapping": "x", "file": 1, "poses": [], "voxel": "x", "start": None, "checkpoint": ["x"],
+    "file": 1, "poses": [], "voxel": "x", "start": None, "checkpoint": ["x"],
 }  # fmt: skip
 
 
@@ -250,7 +260,7 @@ def values(name: str, stage: Stage) -> dict[str, object]:
         "list": "[1, 2]",
         "odd record": json.dumps(ODD_RECORD),
         "long record": json.dumps({"seed": "x" * 2**20, "attributes": {f"n{k}": k for k in range(1000)}}),
-        "large numbers": json.dumps({"betas": [1e300] * 10, "most_overlapping": 1e18, "poses": [1] * 9, "voxel": 1}),
+        "large numbers": json.dumps({"betas": [1e300] * 10, "poses": [1] * 9, "voxel": 1}),
     }
     if name in TEXT_ONLY:
         return dict(texts)

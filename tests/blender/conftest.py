@@ -69,7 +69,8 @@ def splats():
 def only_volumes(request, monkeypatch):
     """New humans are shown by volumes on every Blender, unless a test asks for `splats`."""
     if "splats" not in request.fixturenames:
-        from blender_primdiffusion.scene import build, parts, representation
+        from blender_primdiffusion.jobs import parts
+        from blender_primdiffusion.scene import build, representation
 
         for module in (build, parts, representation):
             monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)

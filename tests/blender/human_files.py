@@ -7,10 +7,9 @@ from pathlib import Path
 
 import bpy
 
-from blender_primdiffusion.scene.human import parts_of
-from blender_primdiffusion.scene.parts import complete_humans
-from blender_primdiffusion.scene.payload import PAYLOAD, session_file, session_folder
-from blender_primdiffusion.scene.volume_files import files_of
+from blender_primdiffusion.jobs.parts import complete_humans
+from blender_primdiffusion.scene.human import PAYLOAD, parts_of, session_file, session_folder
+from blender_primdiffusion.scene.volume_nodes import files_of
 
 
 def person_file(person: bpy.types.Object) -> Path:

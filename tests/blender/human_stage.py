@@ -11,7 +11,7 @@ from oracle import evaluated_matrices
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.volume_files import are_written
+from blender_primdiffusion.scene.volume_nodes import are_written
 
 COUNT = 6
 

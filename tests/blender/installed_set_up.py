@@ -20,7 +20,7 @@ setup = import_module(f"{module}.ui.setup")
 preferences = import_module(f"{module}.ui.preferences")
 state_of = import_module(f"{module}.backend.environment").state_of
 places = import_module(f"{module}.places")
-preferences._own_python_will_do = lambda: False  # as in a Blender that is no module of a Python with torch
+preferences.own_python_has_backend = lambda **_: False  # as in a Blender that is no module of a Python with torch
 report = {
     "blender": bpy.app.version_string,
     "root": str(places.set_up_folder().root),

@@ -6,8 +6,7 @@ import bpy
 import numpy as np
 from synthetic import frames, skinning
 
-from blender_primdiffusion.scene.volume_files import write_volumes
-from blender_primdiffusion.scene.volume_nodes import volumes_of
+from blender_primdiffusion.scene.volume_nodes import volumes_of, write_volumes
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Blender from backend, written out by hand: forward +z becomes -y, up +y becomes +z."""

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from blender_primdiffusion.scene.edit import Replaced, replace_person
-from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import write_volumes
 
 
 def replace(collection: bpy.types.Collection, person: Path) -> Replaced:

@@ -20,8 +20,7 @@ from jobs_driven import drive
 from scene_state import state
 from shown_words import ways
 
-from blender_primdiffusion.jobs.edit import EditJob
-from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.generate import EditJob, GenerateJob
 from blender_primdiffusion.jobs.parts import complete
 from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
@@ -164,7 +163,7 @@ def backend_missing(_person) -> None:
     def nowhere(*_, **__):
         raise BackendNotFound("the preferences name the Python '/nowhere/python', which does not exist: set it up")
 
-    environment.search = nowhere
+    environment.find_python = nowhere
 
 
 def two_people(_person) -> None:
@@ -194,7 +193,7 @@ SOURCE: dict[str, Path] = {}
 def anna(addon, tmp_path, monkeypatch):
     from blender_primdiffusion.backend import environment
 
-    monkeypatch.setattr(environment, "search", environment.search)  # after `backend_missing`
+    monkeypatch.setattr(environment, "find_python", environment.find_python)  # after `backend_missing`
     SOURCE.update(file=synthetic_shape.write(tmp_path / "human", 8))
     monkeypatch.setenv("FAKE_HUMAN", str(SOURCE["file"]))
     person = build_human(addon, SOURCE["file"], "Anna")
@@ -209,7 +208,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """Nothing is downloaded or installed."""
-    from blender_primdiffusion.jobs.steps import Session
+    from blender_primdiffusion.jobs.follow import Session
 
     def start(session: Session, _steps: object) -> None:
         session.notice = "as if it were done"

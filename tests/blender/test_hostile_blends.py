@@ -17,10 +17,9 @@ from blender_primdiffusion.backend.environment import BackendNotFound, candidate
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.jobs.volumes import faults, write_before_rendering
 from blender_primdiffusion.places import EXTENSION, preference
-from blender_primdiffusion.scene import payload
-from blender_primdiffusion.scene.human import body_of
-from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_folder
-from blender_primdiffusion.scene.volume_files import are_written
+from blender_primdiffusion.scene import human
+from blender_primdiffusion.scene.human import BODY, PAYLOAD, body_of, session_folder
+from blender_primdiffusion.scene.volume_nodes import are_written
 from blender_primdiffusion.ui.preferences import known
 
 
@@ -120,7 +119,7 @@ def test_a_damaged_or_foreign_packed_file_shows_the_body_and_is_told_once(pristi
 
 def test_a_packed_file_above_the_limit_is_not_read(pristine, monkeypatch):
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
-    monkeypatch.setattr(payload, "LARGEST_PERSON", 1000)
+    monkeypatch.setattr(human, "LARGEST_PERSON", 1000)
     with refused(ValueError, "holds no data"):
         person_file(person())
 
@@ -156,9 +155,9 @@ def test_a_python_beside_the_file_is_not_run_and_the_preferences_say_why(beside,
     preferences.backend_python = named
     with refused(BackendNotFound):
         list(candidates(preference("backend_python"), None))
-    monkeypatch.undo()  # the fixture's search
+    monkeypatch.undo()  # the fixture's own find_python
     with refused(BackendNotFound):
-        list(environment.search(preference("backend_python")))
+        environment.find_python(preference("backend_python"))
     found = known()
     assert not found.usable
     assert "depends on the file that is open" in found.line

@@ -14,7 +14,7 @@ import synthetic_shape
 from exporting import write_person
 from scene_state import state
 
-from blender_primdiffusion.jobs.steps import Session
+from blender_primdiffusion.jobs.follow import Session
 from blender_primdiffusion.scene.build import build_human
 
 LONGEST_SENTENCE = 300

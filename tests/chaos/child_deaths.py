@@ -8,7 +8,7 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -45,8 +45,7 @@ class Deaths:
         self.tally = Tally()
         self.hangs = 0
 
-    def _fake(self) -> Generator[None, None, BackendClient]:
-        yield
+    def _fake(self) -> BackendClient:
         human = {"FAKE_HUMAN": str(self._human)}
         return BackendClient(Path(sys.executable), FAKE_CHILD, human, silence_s=NOTICED_S)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator
 from pathlib import Path
 
 from waiting import BACKEND
@@ -17,11 +16,7 @@ _PICTURE_PX = 16
 def this_pythons_backend(**settings) -> Backend:
     """The real child on the Python that runs the tests; `settings` of the client."""
 
-    def make_client() -> Generator[None, None, BackendClient]:
-        yield
-        return BackendClient(Path(sys.executable), BACKEND, **settings)
-
-    return Backend(make_client)
+    return Backend(lambda: BackendClient(Path(sys.executable), BACKEND, **settings))
 
 
 def _request(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> ChildRequest:

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 from child_requests import generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
-from waiting import BACKEND
 
 from blender_primdiffusion.backend.client import BackendClient
-from blender_primdiffusion.backend.environment import BackendNotFound, ImportTimedOut
+from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.backend.requests import Backend, ChildRequest
 
 PYTHON = Path(sys.executable)
@@ -61,23 +60,6 @@ def test_a_request_runs_from_a_cold_start_to_its_files(start):
     assert any(eta is not None and eta > 0 for eta in etas)
     assert request.info["device"] in ("cpu", "cuda")
     assert not request.tick(), "a finished request stays as it is"
-
-
-def test_a_child_that_was_being_started_when_all_was_shut_down_is_ended_too(checkpoint, tmp_path):
-    clients = []
-
-    def slowly():
-        for _ in range(3):
-            yield
-        clients.append(BackendClient(PYTHON, BACKEND))
-        return clients[0]
-
-    backend = Backend(slowly)
-    request = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
-    request.tick()
-    backend.shutdown()
-    assert follow(request)[-1] == "failed"
-    assert not clients[0].alive
 
 
 def test_a_second_request_uses_the_same_child(start, backend):
@@ -152,14 +134,36 @@ def test_a_missing_python_is_the_requests_error(tmp_path):
     assert str(request.error) == "No Python for the backend: name one in the preferences."
 
 
-def test_a_python_that_took_too_long_is_an_error_of_its_own(tmp_path):
-    def busy():
-        raise ImportTimedOut("python did not import torch within 90 s")
-        yield
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "echo \"ModuleNotFoundError: No module named 'primdiffusion'\" >&2; exit 1",
+            "No module named 'primdiffusion'",
+        ),
+        ("echo hello", "hello"),
+    ],
+)
+def test_a_python_that_cannot_run_the_backend_is_named_with_its_reason_and_what_to_do(tmp_path, text, reason):
+    python = tmp_path / "python"
+    python.write_text(f"#!/bin/sh\n{text}\n")
+    python.chmod(0o755)
+    request = generate_request(Backend(lambda: BackendClient(python)), seed=1, steps=1, out_dir=tmp_path / "out")
+    assert follow(request)[-1] == "failed"
+    assert request.error.kind == "environment"
+    assert f"{python} cannot run the backend: " in str(request.error)
+    assert reason in str(request.error)
+    assert "Name a Python 3.11" in str(request.error)
 
-    request = generate_request(Backend(busy), seed=1, steps=1, out_dir=tmp_path / "out")
-    assert follow(request) == ["starting", "failed"]
-    assert request.error.kind == "timeout"
+
+def test_a_python_that_is_not_there_is_named_with_what_to_do(tmp_path):
+    for python in (tmp_path / "no-python", tmp_path):
+        request = generate_request(
+            Backend(lambda at=python: BackendClient(at)), seed=1, steps=1, out_dir=tmp_path / "out"
+        )
+        assert follow(request) == ["starting", "failed"]
+        assert str(python) in str(request.error)
+        assert "Name a Python 3.11" in str(request.error)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")

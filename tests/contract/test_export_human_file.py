@@ -10,13 +10,13 @@ from support.errors import refused
 
 from blender_primdiffusion.scene.human_file import (
     HumanMotion,
+    default_body,
     motion_in,
     read_tensors,
     reshaped,
     with_motion,
     write_tensors,
 )
-from blender_primdiffusion.scene.rest_human import default_body
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from primdiffusion.human_file import load_human, save_human
 from support.errors import refused
 from tiny_model import tiny_model
 
-from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene.human_file import read_human
 
 Tensors = dict[str, torch.Tensor]
 

@@ -32,7 +32,7 @@ ALLOWED = {
         "training/state.py",
     },
     "PIL.Image.open": {"geometry/pictures.py"},
-    "shutil.rmtree": {"files/regular_files.py", "capture/launch.py"},  # launch: Blender's own folder
+    "shutil.rmtree": {"files/regular_files.py", "capture/__main__.py"},  # launch: Blender's own folder
     "unlink": {"files/regular_files.py"},
     "os.unlink": {"backend/child_process.py"},  # a temporary file while it is open
     "os.remove": set(),

@@ -15,12 +15,13 @@ from blender_primdiffusion.jobs.export import opened
 from blender_primdiffusion.scene.human_file import (
     body_arrays,
     compacted,
+    default_body,
     expanded,
+    read_human,
     read_payload,
     read_tensors,
     write_tensors,
 )
-from blender_primdiffusion.scene.rest_human import default_body, read_human
 
 
 @pytest.fixture(scope="module")

@@ -208,8 +208,7 @@ def test_the_self_test_compiles_what_the_first_press_needs(tmp_path, monkeypatch
     assert sorted(cache.rglob("*.nbc")) == compiled
 
 
-def _client(cache: Path):
-    yield
+def _client(cache: Path) -> BackendClient:
     return BackendClient(PYTHON, BACKEND, cache_dir=cache)
 
 

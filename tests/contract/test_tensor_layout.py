@@ -117,7 +117,7 @@ def test_sizes_that_are_kept_do_not_keep_the_file(tmp_path):
     for name, shape in parts.items():
         header[name] = entry("F32", shape, start, start := start + 4 * int(np.prod(shape)))
     path = written(tmp_path / "a.human", header, np.ones(start // 4, "<f4").tobytes())
-    sizes = human_file.read_sizes(human_file.file_version(path))
+    sizes = human_file.read_sizes(path)
     for values in (sizes.delta_scale, sizes.betas, sizes.rest_half_extent):
         assert values is not None
         assert values.base is None

@@ -14,7 +14,7 @@ UNDER_THE_RULES = (
     "tests/backend/formats",
     "tests/contract/test_capture_layout.py",
     "tests/contract/test_client.py",
-    "tests/contract/test_shared_frames.py",
+    "tests/contract/test_drawing_child.py",
     "tests/backend/capture/test_render.py::test_captures_have_the_layouts_files_and_are_whole",
     "tests/backend/capture/test_render.py::test_what_is_there_is_kept_and_what_is_missing_is_made",
 )

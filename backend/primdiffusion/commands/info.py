@@ -6,8 +6,6 @@ import dataclasses
 import json
 from typing import Any
 
-import torch
-
 from primdiffusion.commands.options import InfoCommand
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
@@ -42,7 +40,7 @@ def _installation(session: Session) -> dict[str, Any]:
         name: read_card(path) if path.exists() else None
         for name, path in (("checkpoint", default_checkpoint()), ("encoder", default_encoder()))
     }
-    return {"version": __version__, "torch": torch.__version__, **session.device_info(), **memory(), **cards}
+    return {"version": __version__, **session.device_info(), **memory(), **cards}
 
 
 def attributes(request: AttributesRequest, session: Session, report: ReportProgress) -> AttributesAnswer:

@@ -26,8 +26,8 @@ class Session:
         self._cache: dict[Callable[[torch.device], Any], Any] = {}
 
     def device_info(self) -> dict[str, Any]:
-        """The device as `ready` and `hello` report it."""
-        return device_info(self.device)
+        """Torch and the device as `ready` and `hello` report them."""
+        return {"torch": torch.__version__, **device_info(self.device)}
 
     def model(self, checkpoint: Path | None) -> DiffusionModel:
         """Load a diffusion model (None: the default); the last one stays loaded."""

@@ -181,6 +181,7 @@ class Ready(Open):
 
     ready: bool = False
     problem: str | None = None
+    torch: str | None = None
     device: str | None = None
     device_name: str | None = None
     device_memory_gb: float | None = None

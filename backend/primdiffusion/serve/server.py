@@ -353,21 +353,13 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
 class ServeCommand:
     """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
 
-    about: bool = False
-    """Print the versions of this program, torch and Python as one line of JSON, and end."""
-
 
 def run(arguments: Sequence[str]) -> None:
     """`primdiffusion serve`."""
     from primdiffusion.commands.command_line import parse  # the child does not need tyro
 
-    if parse(ServeCommand, arguments, "serve").about:
-        import torch  # `hello` is answered before it is loaded
-
-        about = {"version": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
-        print(json.dumps(about))
-    else:
-        main()
+    parse(ServeCommand, arguments, "serve")
+    main()
 
 
 def main() -> None:

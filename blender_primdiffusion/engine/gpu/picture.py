@@ -14,7 +14,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..boxes import Boxes
-from ..solids import SceneSolids
+from ..picture import SceneSolids
 from ..view import NO_SURFACE_M, PinholeView, opengl_projection
 from .march import GpuMarcher, GpuPayload
 from .shaders import TILE, cache_until_exit, compiled, shader_of

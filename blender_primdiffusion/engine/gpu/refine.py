@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -30,18 +30,6 @@ _FIRST_WORK = 2.0**15
 _GROWTH = 4.0
 
 
-class Pass(Protocol):
-    """One picture that is being marched, such as a `GpuMarch`."""
-
-    def advance(self, work: float) -> bool:
-        """March for about this work, in pixels times boxes; True when the picture is complete."""
-        ...
-
-    def wait(self) -> None:
-        """Return when the GPU has finished what it was given."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True)
 class MarchRequest:
     """A picture that a view should show; compared by `key`."""
@@ -50,9 +38,9 @@ class MarchRequest:
     """Equal for equal pictures."""
     view: PinholeView
     """At the window's resolution."""
-    begin: Callable[[PinholeView, int], Pass]
-    """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels, and with steps
-    along rays that are longer by this factor."""
+    begin: Callable[[PinholeView, int], Any]
+    """Starts a picture, a `GpuMarch` or `GpuPicture`: from this view with fewer pixels, or with its rays elsewhere in
+    the pixels, and with steps along rays that are longer by this factor."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,18 +6,18 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.human import BODY_MARK, PROXY_MARK, human_of
-from ...scene.human_file import FileVersion, file_version, read_payload
+from ...scene.human_file import read_payload
 from ...scene.splats import SPLATS_MARK
 from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of
-from ..picture import PosedHuman, human_armatures, pose_of
-from ..solids import visible_instances
+from ..picture import PosedHuman, human_armatures, pose_of, visible_instances
 from ..who_draws import Drawer, who_draws
 from .march import GpuPayload
 from .shaders import cache_until_exit
@@ -40,29 +40,28 @@ class GpuHumans:
     """Payloads on the GPU, by file."""
 
     def __init__(self) -> None:
-        self._payloads: dict[FileVersion, GpuPayload] = {}
+        self._payloads: dict[Path, GpuPayload] = {}
         """The latest used last."""
 
     def placed(self, human: PosedHuman) -> tuple[GpuPayload, Boxes]:
         """Payload and boxes of one human. Raises OSError or ValueError for files, as `read_payload` and `boxes_of`."""
-        version, boxes = file_version(human.file), boxes_of(human)
-        payload = self._payloads.pop(version, None)
+        boxes, payload = boxes_of(human), self._payloads.pop(human.file, None)
         if payload is None:
             tensors = read_payload(human.file)
             payload = GpuPayload(tensors.rgb, tensors.density)
-        self._payloads[version] = payload
+        self._payloads[human.file] = payload
         return payload, boxes
 
     def holds(self, human: PosedHuman) -> bool:
         """Whether the human's payload is on the GPU already."""
-        return file_version(human.file) in self._payloads
+        return human.file in self._payloads
 
     def keep_only(self, drawn: Iterable[PosedHuman]) -> None:
         """Free the payloads of others, but for the latest PAYLOADS_KEPT."""
         files = {human.file for human in drawn}
-        others = [version for version in self._payloads if version.path not in files]
-        for version in others[:-PAYLOADS_KEPT]:
-            del self._payloads[version]
+        others = [file for file in self._payloads if file not in files]
+        for file in others[:-PAYLOADS_KEPT]:
+            del self._payloads[file]
 
 
 @cache_until_exit
@@ -176,7 +175,7 @@ def concerns_humans(changed: bpy.types.ID) -> bool:
 
 def _key(pose: PosedHuman) -> object:
     betas = None if pose.betas is None else tuple(pose.betas)
-    return file_version(pose.file), pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
+    return pose.file, pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
 
 
 def _noting(

@@ -15,8 +15,7 @@ from support.errors import refused
 
 from blender_primdiffusion.engine.boxes import BoxRig, boxes_of
 from blender_primdiffusion.engine.picture import PosedHuman
-from blender_primdiffusion.scene.human_file import file_version, read_payload, read_sizes, read_tensors
-from blender_primdiffusion.scene.rest_human import default_body
+from blender_primdiffusion.scene.human_file import default_body, read_payload, read_sizes, read_tensors
 
 pytestmark = pytest.mark.any_blender
 CASES = 20
@@ -70,7 +69,7 @@ def test_a_body_with_another_number_of_boxes_is_rejected(plain):
     per_box = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
     fewer = dataclasses.replace(model, **{name: getattr(model, name)[:4] for name in per_box})
     with refused(ValueError, plain.file.name):
-        BoxRig(fewer).place(posed(plain), read_sizes(file_version(plain.file)))
+        BoxRig(fewer).place(posed(plain), read_sizes(plain.file))
 
 
 def test_what_is_scaled_to_zero_is_rejected_by_name(plain):
@@ -92,11 +91,7 @@ def test_a_payload_is_read_as_the_backend_wrote_it(person):
     assert (payload.rest_half_extent is None) == (person.kind == "default")
 
 
-def test_sizes_are_read_once_until_the_file_changes(plain, tmp_path):
-    path = tmp_path / "copy.human.safetensors"
-    path.write_bytes(plain.file.read_bytes())
-    first = read_sizes(file_version(path))
-    assert read_sizes(file_version(path)) is first
+def test_sizes_are_read_once(plain):
+    first = read_sizes(plain.file)
+    assert read_sizes(plain.file) is first
     assert first.rgb.size == first.density.size == 0
-    os.utime(path, ns=(1, 1))
-    assert read_sizes(file_version(path)) is not first

@@ -20,10 +20,9 @@ from support.errors import refused
 from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
-from blender_primdiffusion.backend.environment import BackendPython
 from blender_primdiffusion.engine import drawing_child
+from blender_primdiffusion.engine.drawing_child import CHANNELS, SharedFrames, frames
 from blender_primdiffusion.engine.engine import render_layer
-from blender_primdiffusion.engine.shared_frames import CHANNELS, SharedFrames, frames
 
 pytestmark = pytest.mark.any_blender
 
@@ -108,16 +107,6 @@ def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
     assert max(engine.progress, default=0.0) < 1.0
 
 
-def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, monkeypatch):
-    def forever(*_: object, **__: object):
-        while True:
-            yield
-
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", forever)
-    drawing = render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
-    assert drawing.state == "cancelled"
-
-
 def test_an_animation_keeps_its_child(stage, tmp_path):
     stage.scene.frame_end = 2
     stage.scene.render.filepath = str(tmp_path / "frame_")
@@ -186,13 +175,13 @@ def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, mon
     assert not list(tmp_path.glob("frame_*"))
 
 
-def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", find_nothing)
+def test_without_a_backend_the_error_says_what_to_do(stage, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.find_python", find_nothing)
     with refused(RuntimeError, "preferences"):
         render()
 
 
-def find_nothing(*_: object, **__: object) -> BackendPython:
+def find_nothing(*_: object) -> None:
     from blender_primdiffusion.backend.environment import BackendNotFound
 
     raise BackendNotFound("No Python for the backend; name one in the extension's preferences.")
@@ -249,13 +238,12 @@ def test_unregistering_ends_the_child_removes_the_frames_and_leaves_the_scene_a_
         blender_primdiffusion.register()
 
 
-def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage, monkeypatch):
-    monkeypatch.setattr(drawing_child, "IDLE_S", 0.3)
+def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage):
     render()
     pid = drawing_child.child_pid()
     end = time.monotonic() + 300
     while drawing_child.child_pid() is not None and time.monotonic() < end:
-        drawing_child.end_when_idle()  # a timer does
+        drawing_child.end_when_idle(0.3)  # a timer does
         time.sleep(0.05)
     assert drawing_child.child_pid() is None
     assert render() == {"FINISHED"}
@@ -271,7 +259,7 @@ from backend_python import use_this_python
 use_this_python(pytest.MonkeyPatch(), Path(sys.argv[1]))
 b.register()
 from blender_primdiffusion.engine import drawing_child
-from blender_primdiffusion.engine.shared_frames import frames
+from blender_primdiffusion.engine.drawing_child import frames
 frame = frames.take(8, 8)
 request = drawing_child.draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
 while request.step == 0:

@@ -27,7 +27,7 @@ from oracle import raised
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene.human_file import read_human
 
 SIZE = (120, 90)
 REST = np.tile(np.eye(3), (24, 1, 1))

@@ -13,7 +13,7 @@ from engine_stage import STEP, Z_UP, add_human, camera_by_hand, eight_bit, rende
 from oracle import world_from_model
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.rest_human import shape_model_of
+from blender_primdiffusion.scene.human_file import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of
 
 SIZE = (120, 90)

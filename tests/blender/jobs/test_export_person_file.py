@@ -10,20 +10,19 @@ import pytest
 import synthetic_shape
 from human_files import forget_session_files, person_file
 
-from blender_primdiffusion.jobs.assets import HumanAssetJob
-from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.export import (
     AddProxyJob,
     ExportGaussiansJob,
     ExportMeshJob,
     ExportVdbSequenceJob,
+    HumanAssetJob,
     posed_frames,
 )
-from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
+from blender_primdiffusion.jobs.generate import EditJob
 from blender_primdiffusion.jobs.queue import Job
-from blender_primdiffusion.jobs.target import HumanTarget
+from blender_primdiffusion.jobs.volumes import MergeJob, PoseSnapshot
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.export_model import FrameRange
+from blender_primdiffusion.scene.human import HumanTarget
 
 
 @pytest.fixture
@@ -38,8 +37,8 @@ def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
         EditJob.of("inpaint", person, {"steps": 3, "region": {"painted": [0.0, 1.0]}, "seed": 3}),
         EditJob.of("transfer", person, {"steps": 3, "other": "/a/b"}),
         EditJob.of("interpolate", person, {"steps": 3, "other": "/a/b", "fraction": 0.5}),
-        MergeJob(target, moment, 0.006),
-        ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
+        MergeJob(target, [moment], 0.006),
+        ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", range(1, 4)),
         AddProxyJob(target, 512, 9000),
         ExportGaussiansJob(target, folder / "ä.ply", posed_frames(context, person, [1])[0], 500),
         ExportVdbSequenceJob(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),

@@ -13,9 +13,8 @@ from jobs_driven import drive, error_of, notice_of
 from oracle import evaluated_matrices
 
 from blender_primdiffusion.jobs import follow as follow_module
-from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.generate import EditJob, GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.volume_nodes import volumes_of

@@ -13,9 +13,9 @@ from jobs_driven import Layout, drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import FAILS, TAKES_LONG, request_of
 
-from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
+from blender_primdiffusion.jobs.windows import icons
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import variations_panel
 

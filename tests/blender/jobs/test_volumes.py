@@ -12,14 +12,12 @@ import blender_primdiffusion
 from benchmarks.cycles_preview import setup_cycles_preview
 from blender_primdiffusion.engine.engine import ENGINE
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.jobs.volumes import VolumesJob, faults, write_before_rendering
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.human import HumanTarget, humans
 from blender_primdiffusion.scene.representation import in_viewport
-from blender_primdiffusion.scene.volume_files import are_written
-from blender_primdiffusion.scene.volume_nodes import volumes_of
+from blender_primdiffusion.scene.volume_nodes import are_written, volumes_of
 
 ops = bpy.ops.primdiffusion
 COUNT = 12

@@ -8,7 +8,7 @@ from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain
 
-from blender_primdiffusion.motion.adjust import rounds_of
+from blender_primdiffusion.motion.placing import rounds_of
 from blender_primdiffusion.motion.poses import FLOOR
 from blender_primdiffusion.ui.motion_panel import built_in_motion
 from scripts.bake_poses import motions

@@ -15,7 +15,7 @@ from pose_assets import pose_asset, pose_from_library
 from support.errors import refused
 
 import blender_primdiffusion
-from blender_primdiffusion.motion.posture import current_pose, rest_joints
+from blender_primdiffusion.motion.poses import current_pose, rest_joints
 from blender_primdiffusion.scene.armature import build_armature, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender

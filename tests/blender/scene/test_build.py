@@ -19,9 +19,8 @@ from blender_primdiffusion.scene import volume_nodes
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
-from blender_primdiffusion.scene.volume_files import open_humans
+from blender_primdiffusion.scene.volume_nodes import open_humans
 
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions", "images", "node_groups")
 
@@ -110,14 +109,11 @@ def test_one_material_serves_all_people(person, saved_scene, tmp_path):
     assert len(humans(bpy.context.scene)) == 2
 
 
-def test_provenance_and_overlaps_are_stored_on_the_collection(person):
+def test_provenance_is_stored_on_the_armature(person):
     collection, arrays = person
     stored = json.loads(collection[MARK])
     assert stored["seed"] == 0
     np.testing.assert_allclose(stored["betas"], arrays["betas"], atol=1e-6)
-    assert overlap_warning(collection) is None
-    collection[MARK] = json.dumps({**stored, "most_overlapping": 40})
-    assert "draws only 31" in overlap_warning(collection)
 
 
 def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):

@@ -17,8 +17,7 @@ from support import tensor_files
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import BETAS, MARK, body_of, human_of, humans, parts_of
-from blender_primdiffusion.scene.payload import state_of
+from blender_primdiffusion.scene.human import BETAS, MARK, body_of, human_of, humans, parts_of, state_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 COUNT = 12

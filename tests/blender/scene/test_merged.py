@@ -34,8 +34,7 @@ from blender_primdiffusion.scene.representation import (
     show_in_viewport,
     stop_showing,
 )
-from blender_primdiffusion.scene.volume_files import write_volumes
-from blender_primdiffusion.scene.volume_nodes import density_gain, volume_material
+from blender_primdiffusion.scene.volume_nodes import density_gain, volume_material, write_volumes
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402

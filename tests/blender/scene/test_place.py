@@ -8,7 +8,7 @@ import synthetic
 from human_files import remove_human
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.place import GAP_M, REACH_M, _extent, stand_at_cursor
+from blender_primdiffusion.scene.place import GAP_M, REACH_M, posed_extent, stand_at_cursor
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_a_human_stands_on_the_floor_beside_the_default_cube(saved_scene, source
     remove_human(free)
     armature = standing(source)
     assert armature.location.z == pytest.approx(soles)
-    assert apart(_extent(armature), ((-1, -1, -1), (1, 1, 1))) == pytest.approx(GAP_M, abs=1e-5)
+    assert apart(posed_extent(armature), ((-1, -1, -1), (1, 1, 1))) == pytest.approx(GAP_M, abs=1e-5)
     assert armature.location.x == 0
     assert -2 < armature.location.y < -1, "before it, which is nearest"
 
@@ -47,7 +47,7 @@ def test_the_second_human_stands_beside_the_first_and_clear_of_solid_objects(sav
     bpy.ops.mesh.primitive_cube_add(size=0.5, location=(1.5, first.location.y, 0.3))
     second = standing(source)
     assert second.location.y == pytest.approx(first.location.y)
-    assert apart(_extent(second), _extent(first)) >= GAP_M - 1e-5
+    assert apart(posed_extent(second), posed_extent(first)) >= GAP_M - 1e-5
     assert second.location.x < 0, "the other side is taken"
 
 
@@ -120,4 +120,4 @@ def test_on_uneven_ground_humans_stand_side_by_side(saved_scene, source):
     bpy.context.object.scale = (60, 60, 1)  # half a metre above the soles, as a hill elsewhere would be
     first, second = standing(source), standing(source)
     assert tuple(first.location) == (0, 0, 0)
-    assert apart(_extent(second), _extent(first)) == pytest.approx(GAP_M, abs=1e-5)
+    assert apart(posed_extent(second), posed_extent(first)) == pytest.approx(GAP_M, abs=1e-5)

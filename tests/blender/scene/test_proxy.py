@@ -10,8 +10,8 @@ from blender_primdiffusion.formats.answers import ProxyAnswer
 from support.errors import refused
 
 from blender_primdiffusion.jobs.export import AddProxyJob
-from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.edit import reshape
+from blender_primdiffusion.scene.human import HumanTarget
 from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, read_proxy, show_textures_in_solid
 from blender_primdiffusion.scene.shape import betas_of
 

@@ -10,8 +10,7 @@ import synthetic_shape
 from scene_stage import render
 
 from benchmarks.cycles_preview import setup_cycles_preview
-from blender_primdiffusion.engine.picture import posed_humans
-from blender_primdiffusion.engine.solids import scene_solids
+from blender_primdiffusion.engine.picture import posed_humans, scene_solids
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.merged import MergedGrid, MergedState, merged_folder, publish, show_merged, write_grid

@@ -17,7 +17,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.editing.reshaping import box_growth
 from primdiffusion.primitives.anchors import attach, default_anchors
 
-from blender_primdiffusion.scene.rest_human import default_body as default_body_here
+from blender_primdiffusion.scene.human_file import default_body as default_body_here
 from blender_primdiffusion.scene.shape import betas_of_measures, measure, slider_names
 
 pytestmark = pytest.mark.any_blender

@@ -17,16 +17,15 @@ from support.errors import refused
 
 from blender_primdiffusion.engine.boxes import boxes_of
 from blender_primdiffusion.engine.picture import posed_humans
+from blender_primdiffusion.jobs.parts import complete_humans
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cells import set_input
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import body_of, humans
-from blender_primdiffusion.scene.parts import complete_humans
 from blender_primdiffusion.scene.representation import representation_of, set_representation
-from blender_primdiffusion.scene.splat_nodes import C0, GROUP_NAME
-from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE, WIDTH, cells_of, cloud_of
+from blender_primdiffusion.scene.splats import C0, GROUP_NAME, SPLATS_AVAILABLE, WIDTH, cells_of, cloud_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 pytestmark = [

@@ -17,8 +17,14 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.scene.representation import representation_of, set_representation, show_in_viewport
-from blender_primdiffusion.scene.volume_files import are_written, open_humans, write_volumes
-from blender_primdiffusion.scene.volume_nodes import GROUP_NAME, set_folder, volumes_of
+from blender_primdiffusion.scene.volume_nodes import (
+    GROUP_NAME,
+    are_written,
+    open_humans,
+    set_folder,
+    volumes_of,
+    write_volumes,
+)
 
 COUNT = 12
 AT_REST = np.tile(np.eye(3), (24, 1, 1)), np.zeros(3)

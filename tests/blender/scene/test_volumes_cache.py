@@ -9,7 +9,7 @@ import synthetic
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.representation import show_in_viewport
-from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import write_volumes
 from blender_primdiffusion.scene.volumes import free_unused_grids
 
 

@@ -19,22 +19,21 @@ from capture_person import _few_faces, chequers, files_of
 from support.errors import refused
 
 import blender_primdiffusion
-from blender_primdiffusion.capture import launch
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.command import MARK, parse, settings_of
 from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
-from blender_primdiffusion.jobs.steps import Session
+from blender_primdiffusion.jobs.follow import Session
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui import captures_session
+from blender_primdiffusion.ui import captures_settings
 from blender_primdiffusion.ui.captures_panel import RIG
-from blender_primdiffusion.ui.captures_session import captures
-from blender_primdiffusion.ui.captures_settings import command_args
+from blender_primdiffusion.ui.captures_settings import captures, command_args
 
 pytestmark = pytest.mark.any_blender
 
 ROOT = Path(__file__).resolve().parents[3]
+LAUNCH = ROOT / "blender_primdiffusion" / "capture" / "__main__.py"
 SMALL = "--poses 2 --cameras 2 --size 48 48 --samples 2 --device cpu --passes img mask depth"
 
 
@@ -122,7 +121,7 @@ def start(settings, tmp_path) -> None:
     """As the operator with a window."""
     folder = tmp_path / "temporary"
     folder.mkdir()
-    captures.start(captures_session.capturing(command_args(settings, bpy.context, folder), folder))
+    captures.start(captures_settings.capturing(command_args(settings, bpy.context, folder), folder))
 
 
 def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
@@ -228,9 +227,9 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
 )  # fmt: skip
 def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, tmp_path, message, fault):
     program = f"import time; print({MARK + message!r}, flush=True); time.sleep(600)"
-    monkeypatch.setattr(captures_session, "child_command", lambda: [sys.executable, "-c", program])
+    monkeypatch.setattr(captures_settings, "child_command", lambda: [sys.executable, "-c", program])
     session = Session("", "")
-    session.start(captures_session.capturing([], tmp_path / "folder"))
+    session.start(captures_settings.capturing([], tmp_path / "folder"))
     end = time.monotonic() + 300
     while session.busy and time.monotonic() < end:
         session.tick()
@@ -260,7 +259,7 @@ def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good
 def test_a_child_whose_parent_is_gone_stops(only_good, tmp_path):
     words = ["--people", str(only_good), "--out", str(tmp_path / "a"), "--progress", "json", "--while-stdin"]
     child = subprocess.Popen(
-        [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
+        [sys.executable, LAUNCH, "--", *words, "--size", "256", "256"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
     assert first_message(child)["total"] == 20 * 36
@@ -273,7 +272,7 @@ def test_a_child_whose_parent_is_gone_stops(only_good, tmp_path):
 def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_good, tmp_path, moment):
     words = ["--people", str(only_good), "--out", str(tmp_path / "a"), "--progress", "json"]
     child = subprocess.Popen(
-        [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
+        [sys.executable, LAUNCH, "--", *words, "--size", "256", "256"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     first_message(child)

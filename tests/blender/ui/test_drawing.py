@@ -21,9 +21,9 @@ from blender_primdiffusion.jobs.queue import JobOutcome, queue
 from blender_primdiffusion.jobs.variations import Variation, sheet
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.rest_human import shape_model_of
+from blender_primdiffusion.scene.human_file import shape_model_of
 from blender_primdiffusion.ui import drawing, generate_panel
-from blender_primdiffusion.ui.captures_session import captures
+from blender_primdiffusion.ui.captures_settings import captures
 
 pytestmark = pytest.mark.any_blender
 SMALL_WINDOW_PX = 620

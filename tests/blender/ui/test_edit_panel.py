@@ -16,7 +16,7 @@ from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 from support.tensor_files import read_tensors
 
-from blender_primdiffusion.jobs.edit import EditJob
+from blender_primdiffusion.jobs.generate import EditJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import painted_weights

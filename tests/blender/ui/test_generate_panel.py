@@ -12,16 +12,14 @@ import bpy
 import numpy as np
 import pytest
 from human_files import person_file
-from jobs_driven import Layout, drive, notice_of, shown
+from jobs_driven import Layout, drive, shown
 from support.errors import refused
 from support.fake_child import FAILS, request_of
 
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene import cycles
-from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.place import GAP_M
+from blender_primdiffusion.scene.place import GAP_M, posed_extent
 from blender_primdiffusion.ui import generate_panel
 
 
@@ -187,14 +185,6 @@ def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as
     assert re.fullmatch(r"Generated in [0-9.]+ s\.", line)
     assert next_step == button
     assert as_mesh == "primdiffusion.add_proxy"
-
-
-def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(addon, monkeypatch):
-    monkeypatch.setattr(cycles, "overlap_of", lambda _: 37)
-    for engine, named in (("BLENDER_WORKBENCH", False), ("CYCLES", True)):
-        addon.scene.render.engine = engine
-        bpy.ops.primdiffusion.generate(seed=7)
-        assert ("Cycles leaves out parts of" in notice_of("generate")) == named
 
 
 def test_the_next_step_waits_until_no_job_is_running(addon):

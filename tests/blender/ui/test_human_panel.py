@@ -18,7 +18,7 @@ from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import BETAS, MARK, body_of, humans
-from blender_primdiffusion.scene.rest_human import shape_model_of
+from blender_primdiffusion.scene.human_file import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human

@@ -19,7 +19,7 @@ from bvh_files import motion_of, write_bvh
 from jobs_driven import Layout
 from support.errors import refused
 
-from blender_primdiffusion.motion.posture import current_pose
+from blender_primdiffusion.motion.poses import current_pose
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human

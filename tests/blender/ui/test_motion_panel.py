@@ -10,7 +10,7 @@ from amass_files import feet, write_amass
 from blender_primdiffusion.formats.poses.files import read_motion
 from jobs_driven import Layout
 
-from blender_primdiffusion.motion.posture import current_pose
+from blender_primdiffusion.motion.poses import current_pose
 from blender_primdiffusion.scene.actions import action_curves, last_key, loops
 from blender_primdiffusion.ui.motion_panel import draw_motion
 

@@ -18,7 +18,7 @@ from blender_primdiffusion.capture.cameras import OpenImageIO, picture_of, pictu
 from blender_primdiffusion.jobs import from_picture
 from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.motion.posture import take_world_posture, world_posture
+from blender_primdiffusion.motion.poses import take_world_posture, world_posture
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import betas_of

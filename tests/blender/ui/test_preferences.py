@@ -18,7 +18,7 @@ def alone(addon, monkeypatch):
     """The viewer, and no backend anywhere."""
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setattr(preferences, "setup", None)
-    monkeypatch.setattr(preferences, "_own_python_will_do", lambda: False)
+    monkeypatch.setattr(preferences, "own_python_has_backend", lambda **_: False)
     monkeypatch.setattr(preferences, "installed_backend", lambda: None)
 
 

@@ -15,8 +15,7 @@ from support.fake_child import request_of
 
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans, parts_of
-from blender_primdiffusion.scene.payload import session_folder
+from blender_primdiffusion.scene.human import humans, parts_of, session_folder
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures

@@ -11,14 +11,13 @@ from human_files import folder_of, remove_human, sequence_files, volume_path
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 
-from blender_primdiffusion.jobs import merge
+from blender_primdiffusion.jobs import volumes
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.target import HumanTarget
+from blender_primdiffusion.jobs.volumes import MergeJob, PoseSnapshot
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import MARK, humans
+from blender_primdiffusion.scene.human import HumanTarget, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.scene.representation import representation_of, show_in_viewport
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
@@ -127,7 +126,7 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "takes long")
     moment = PoseSnapshot.capture(person)
     before = sorted(folder_of(person).iterdir())
-    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment, moment], 1, 0.02))
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), [moment, moment], 0.02, 1))
     until_running()
     queue.cancel()
     drive()
@@ -137,10 +136,10 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
 
 def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch):
     written, ticks = [], [0]
-    write_grid = merge.write_grid
-    monkeypatch.setattr(merge, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
+    write_grid = volumes.write_grid
+    monkeypatch.setattr(volumes, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
     moment = PoseSnapshot.capture(person)
-    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment] * 5, 1, 0.02))
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), [moment] * 5, 0.02, 1))
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == 5
@@ -160,7 +159,7 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
 
 
 def test_a_human_removed_meanwhile_is_not_merged(person):
-    queue.add(bpy.context, MergeJob(HumanTarget.of(person), PoseSnapshot.capture(person), 0.02))
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), [PoseSnapshot.capture(person)], 0.02))
     remove_human(person)
     drive()
     assert "was removed" in error_of("merge")
@@ -182,11 +181,10 @@ def test_panels_show_representations_and_warnings(person):
     ops.merge()
     assert advanced().count("set_representation") == 2 + SPLATS_AVAILABLE
     ops.merge(what="NOTHING")
-    person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
     context.scene.render.engine = "CYCLES"
-    assert "volumes overlap" in advanced()
+    assert "31 volumes" in advanced()
     context.scene.render.engine = "PRIMDIFFUSION"
-    assert "volumes overlap" not in advanced(), "of no interest to this engine"
+    assert "31 volumes" not in advanced(), "of no interest to this engine"
     assert shown(render_panel.PRIMDIFFUSION_PT_render, context).count("primdiffusion.set_up_engine") == 2
 
 

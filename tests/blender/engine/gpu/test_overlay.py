@@ -23,8 +23,7 @@ from blender_primdiffusion.engine.view import NO_SURFACE_M, clip_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import body_of
-from blender_primdiffusion.scene.volume_files import write_volumes
-from blender_primdiffusion.scene.volume_nodes import volumes_of
+from blender_primdiffusion.scene.volume_nodes import volumes_of, write_volumes
 from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 

@@ -11,7 +11,7 @@ from gpu_stage import boxes_of, pinhole, placed, read
 
 from blender_primdiffusion.engine.gpu.picture import GpuPicture, GpuScene, GpuSolids
 from blender_primdiffusion.engine.gpu.refine import SAMPLES, jittered
-from blender_primdiffusion.engine.solids import SceneSolids
+from blender_primdiffusion.engine.picture import SceneSolids
 from blender_primdiffusion.engine.view import view_from_matrices
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 

@@ -19,11 +19,12 @@ try:
     import tensor_files
 except ModuleNotFoundError:  # an environment of tests/contract/tiny_packages.py
     import tiny
+    import torch
 
     tensor_files = None
-    PROBLEM = tiny.PROBLEM
+    PROBLEM, TORCH = tiny.PROBLEM, torch.__version__
 else:
-    PROBLEM = None
+    PROBLEM, TORCH = None, "0"
 
 HERE = Path(__file__).parent
 PERSON = "person.human.safetensors"
@@ -270,7 +271,7 @@ for line in sys.stdin:
         say(id=id, result={"version": "0-fake", "device_name": None})
         if ORDER == "imports slowly":
             time.sleep(LONG * STEP_S)
-        about = {"ready": True, "problem": PROBLEM, "device": "cpu", "device_name": "fake device"}
+        about = {"ready": True, "problem": PROBLEM, "torch": TORCH, "device": "cpu", "device_name": "fake device"}
         say(method="ready", params=about)
     elif method in ANSWERS:
         _cancelled.clear()

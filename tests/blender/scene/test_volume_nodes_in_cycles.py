@@ -12,9 +12,8 @@ from support.errors import refused
 from benchmarks.cycles_preview import setup_cycles_preview
 from blender_primdiffusion.scene.armature import model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.cycles import posed_extent
-from blender_primdiffusion.scene.volume_files import write_volumes
-from blender_primdiffusion.scene.volume_nodes import GAIN_NODE, MATERIAL_NAME
+from blender_primdiffusion.scene.place import posed_extent
+from blender_primdiffusion.scene.volume_nodes import GAIN_NODE, MATERIAL_NAME, write_volumes
 
 RED = (0.6, 0.1, 0.05)
 DENSITY = 20.0

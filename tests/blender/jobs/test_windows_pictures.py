@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from blender_primdiffusion.jobs.pictures import Icons
+from blender_primdiffusion.jobs.windows import Icons
 
 pytestmark = pytest.mark.any_blender
 

@@ -14,7 +14,7 @@ from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from bvh_files import motion_of, write_bvh
 from support.errors import refused
 
-from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample
+from blender_primdiffusion.motion.placing import cut, from_origin, in_place, leg_ratio, on_floor, resample
 
 pytestmark = pytest.mark.any_blender
 

@@ -1,17 +1,26 @@
-"""Adjust motion: frame rate, range, place, floor, and length of the path for other legs."""
+"""Motion put onto armatures and read back from them, and what fits it to them: frame rate, range, place, floor, and
+length of the path for other legs."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 
+import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.motion import Motion
-from ..formats.poses.rotation import from_quaternion, matrix_to_quaternion, slerp
-from ..formats.poses.skeleton import REST_JOINTS, joint_positions
-from ..scene.convention import continuous_quaternions
+from ..formats.poses.rotation import from_quaternion, matrix_to_quaternion, nearest, slerp
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions, unchain
+from ..scene.actions import last_key, posed_on, push_to_strip
+from ..scene.armature import append_poses, keyframe_poses, model_origin, rest_rotations
+from ..scene.blend_values import stored_numbers
+from ..scene.convention import BLENDER_FROM_BACKEND, continuous_quaternions, points_to_backend
+from ..scene.handles import check_no_handles
+from ..scene.human import BETA_COUNT, BETAS
+from .poses import check_posable, rest_joints
 
 _FEET = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]
 _STANDING_SHARE = 5.0
@@ -146,3 +155,116 @@ def _legs(rest: NDArray) -> float:
     ways = (("hip", "knee"), ("knee", "ankle"))
     ends = [(JOINT_NAMES.index(f"{s}_{a}"), JOINT_NAMES.index(f"{s}_{b}")) for s in ("left", "right") for a, b in ways]
     return float(sum(np.linalg.norm(rest[a] - rest[b]) for a, b in ends))
+
+
+FACTS = "primdiffusion_motion"
+"""Custom property of an action: what its motion is, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Placement:
+    """How a motion is to be put onto an armature."""
+
+    start: float = 1.0
+    """Frame of the first key; ignored for APPEND, which begins a frame after the last key."""
+    timing: str = "SCENE"
+    """SCENE: a key on every frame of the scene; SOURCE: one for every frame of the motion."""
+    first: int = 1
+    """Frame of the motion, counted from 1."""
+    last: int = 0
+    """The same; 0 is the last there is."""
+    stride: int = 1
+    scale: float = 1.0
+    """Factor on the path."""
+    fit_stride: bool = True
+    """Whether the path is scaled to the armature's legs, before `scale`."""
+    root: str = "ORIGIN"
+    """ORIGIN: the path begins at the human; KEEP: it stays as in the file; PLACE: the human stays in place."""
+    ground: bool = True
+    """Whether the whole motion is moved onto the floor."""
+    into: str = "NEW"
+    """NEW: an action; APPEND: to the one there is; STRIP: a strip of the nonlinear animation."""
+
+
+def place_motion(
+    context: bpy.types.Context, armature: bpy.types.Object, motion: Motion, how: Placement
+) -> tuple[float, float]:
+    """Set the keys; returns the first and last frame. Raises ValueError before anything is changed."""
+    check_posable(armature)
+    check_no_handles(armature)
+    rest = rest_joints(armature)
+    ratio = stride_ratio(motion, rest) if how.fit_stride else None
+    way = dataclasses.replace(how, scale=how.scale * (1.0 if ratio is None else ratio))
+    fitted, times = fit(motion, rest, scene_fps(context.scene), way)
+    start = how.start
+    if how.into == "APPEND":
+        end = last_key(armature)
+        start = end + 1.0 if np.isfinite(end) else how.start
+    frames = start + times
+    if how.into == "APPEND":
+        append_poses(armature, frames, fitted.rotations, fitted.translations)
+        action = armature.animation_data.action
+    else:
+        action = keyframe_poses(armature, frames, fitted.rotations, fitted.translations, motion.name)
+        action.use_fake_user = True
+    action[FACTS] = json.dumps({**facts(motion), "Stride": "as in the file" if ratio is None else f"x {ratio:.2f}"})
+    if how.into == "STRIP":
+        push_to_strip(armature)
+    return float(frames[0]), float(frames[-1])
+
+
+def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement) -> tuple[Motion, NDArray[np.float64]]:
+    """The motion fitted to a skeleton at rest [24, 3], and its frames in the scene [F], from 0."""
+    fitted = cut(motion, how.first, how.last, how.stride)
+    if how.timing == "SCENE":
+        fitted = resample(fitted, scene_rate)
+    fitted = scale_places(fitted, how.scale)
+    if how.root != "KEEP":
+        fitted = in_place(fitted) if how.root == "PLACE" else from_origin(fitted)
+    if how.ground:
+        fitted = on_floor(fitted, rest)
+    return fitted, np.arange(len(fitted)) * (scene_rate / fitted.fps)
+
+
+def facts(motion: Motion) -> dict[str, str]:
+    """Facts about a motion for display, label to text."""
+    found = motion.detected
+    rate = f"{motion.fps:.4g}" + ("" if found.fps else " (assumed)")
+    bones = {"Bones": f"{len(found.bones)} of 24"} if found.bones else {}
+    people = {"People": f"{len(found.people)}: {', '.join(found.people[:6])}"} if len(found.people) > 1 else {}
+    return {
+        "Rig": found.rig or "unknown",
+        **people,
+        **bones,
+        "Up Axis": found.up + (" (uncertain)" if found.doubt else ""),
+        "Frames": f"{len(motion)} ({len(motion) / motion.fps:.1f} s)",
+        "Frame Rate": rate,
+        "Units": found.unit,
+    }
+
+
+def scene_fps(scene: bpy.types.Scene) -> float:
+    """Frames per second, such as 23.976."""
+    return scene.render.fps / scene.render.fps_base
+
+
+def extend_range(scene: bpy.types.Scene, last: float) -> None:
+    """Extend the scene to the end of the motion."""
+    scene.frame_end = max(scene.frame_end, int(np.ceil(last)))
+
+
+def sample_motion(
+    context: bpy.types.Context, armature: bpy.types.Object, frames: range
+) -> tuple[Motion, NDArray[np.float64], NDArray[np.float64]]:
+    """The motion on some frames in the armature's own space, the shape [n], the rest pelvis [3].
+
+    The object's own transform is left out. Raises ValueError where one of SMPL's joints is missing.
+    """
+    rest, pelvis = rest_rotations(armature), rest_joints(armature)[0]
+    shown = posed_on(context, armature, frames)
+    bones = np.array([[np.array(one.pose.bones[name].matrix) for name in JOINT_NAMES] for one in shown], np.float64)
+    world = nearest(bones[..., :3, :3]) @ np.swapaxes(rest, -1, -2)
+    world = BLENDER_FROM_BACKEND.T @ world @ BLENDER_FROM_BACKEND
+    places = points_to_backend(bones[:, 0, :3, 3] - model_origin(armature.data)) - pelvis
+    motion = Motion(unchain(world), places, scene_fps(context.scene), armature.name)
+    return motion, np.array(stored_numbers(armature, BETAS, BETA_COUNT) or [0.0] * BETA_COUNT), pelvis

@@ -15,8 +15,8 @@ from human_stage import build_posed, named, whole
 
 import blender_primdiffusion
 from benchmarks.cycles_preview import setup_cycles_preview
+from blender_primdiffusion.scene.build import STAND_IN
 from blender_primdiffusion.scene.human import body_of, parts_of
-from blender_primdiffusion.scene.stand_in import STAND_IN
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 WITHOUT = """

@@ -10,7 +10,7 @@ import pytest
 from engine_stage import add_human, cube, material, render_exr, render_png, set_up_render
 from support.errors import refused
 
-from blender_primdiffusion.engine.solids import SceneSolids, base_colour, changed_by, scene_solids, stored
+from blender_primdiffusion.engine.picture import SceneSolids, base_colour, changed_by, scene_solids, stored
 from blender_primdiffusion.scene.human import body_of
 
 

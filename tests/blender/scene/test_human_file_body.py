@@ -12,7 +12,7 @@ from support.errors import refused
 
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.rest_human import body_of_file, shape_model_of
+from blender_primdiffusion.scene.human_file import body_beside, read_payload, shape_model_of
 
 SPOILED = {
     "shape_basis": {"shape_basis": np.zeros((7, 3, 10))},
@@ -40,7 +40,7 @@ def body_file(person):
 def test_a_broken_field_is_named_in_one_sentence(tmp_path, name):
     path = synthetic_shape.write(tmp_path / "human", **SPOILED[name])
     with refused(ValueError, name):
-        body_of_file(path)
+        body_beside(path, read_payload(path))
 
 
 def test_the_model_comes_back_from_its_file_bit_for_bit(person):
@@ -55,12 +55,12 @@ def test_a_missing_or_damaged_file_is_named_with_what_to_do(tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole[:1000])
     with refused(ValueError, "damaged"):
-        body_of_file(file)
+        body_beside(file, read_payload(file))
     path.unlink()
     with refused(FileNotFoundError, "missing"):
-        body_of_file(file)
+        body_beside(file, read_payload(file))
     path.write_bytes(whole)
-    assert body_of_file(file).template.shape == (736, 3)
+    assert body_beside(file, read_payload(file)).template.shape == (736, 3)
 
 
 def test_the_file_is_packed_and_written_again_where_it_was_removed(person, tmp_path):

@@ -11,9 +11,9 @@ from human_files import copy_of, paths_of, press_x
 from human_stage import build_posed, named, places, whole
 
 from blender_primdiffusion.jobs import parts as module
+from blender_primdiffusion.jobs.parts import complete_humans, orphans, without_parts
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import PROXY_MARK, body_of, humans, parts_of
-from blender_primdiffusion.scene.parts import complete_humans, orphans, without_parts
 from blender_primdiffusion.scene.shape import betas_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 

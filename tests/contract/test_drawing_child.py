@@ -3,7 +3,7 @@
 import pytest
 from primdiffusion.commands.frame_drawer import map_frame
 
-from blender_primdiffusion.engine.shared_frames import SharedFrames
+from blender_primdiffusion.engine.drawing_child import SharedFrames
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import synthetic_shape
 from support import tensor_files
 from support.errors import refused
 
-from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene.human_file import read_human
 
 pytestmark = pytest.mark.any_blender
 

@@ -12,7 +12,7 @@ from jobs_driven import drive, until_running
 from support.errors import refused
 from support.fake_child import TAKES_LONG
 
-from blender_primdiffusion.jobs import memory
+from blender_primdiffusion.jobs import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
@@ -61,38 +61,39 @@ def test_memory_is_not_released_while_the_child_is_busy(addon):
 def test_an_idle_child_is_ended_after_the_minutes_of_the_preferences(addon, monkeypatch):
     pid = started_and_idle()
     begun = queue.idle_since
-    assert memory.idle_minutes() == 10.0
-    assert not memory.release_when_idle(begun + 599)
-    monkeypatch.setattr(memory, "idle_minutes", lambda: 0.0)
-    assert not memory.release_when_idle(begun + 10_000)
-    monkeypatch.setattr(memory, "idle_minutes", lambda: 10.0)
-    assert memory.release_when_idle(begun + 601)
+    assert follow.idle_minutes() == 10.0
+    assert not follow.release_when_idle(begun + 599)
+    monkeypatch.setattr(follow, "idle_minutes", lambda: 0.0)
+    assert not follow.release_when_idle(begun + 10_000)
+    monkeypatch.setattr(follow, "idle_minutes", lambda: 10.0)
+    assert follow.release_when_idle(begun + 601)
     assert ended(pid)
-    assert not memory.release_when_idle(begun + 700), "nothing is left to end"
+    assert not follow.release_when_idle(begun + 700), "nothing is left to end"
 
 
 @pytest.mark.parametrize("renders", [False, True])
 def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, monkeypatch, renders):
     started_and_idle()
     freed = []
-    monkeypatch.setattr(memory, "free_unused_grids", lambda: freed.append(1))
-    monkeypatch.setattr(memory, "idle_minutes", lambda: 10.0)
-    monkeypatch.setattr(memory, "bpy", SimpleNamespace(app=SimpleNamespace(is_job_running=lambda _: renders)))
-    assert memory.release_when_idle(queue.idle_since + 601)
+    monkeypatch.setattr(follow, "free_unused_grids", lambda: freed.append(1))
+    monkeypatch.setattr(follow, "idle_minutes", lambda: 10.0)
+    with monkeypatch.context() as during:
+        during.setattr(follow, "bpy", SimpleNamespace(app=SimpleNamespace(is_job_running=lambda _: renders)))
+        assert follow.release_when_idle(queue.idle_since + 601)
     assert len(freed) == (0 if renders else 1)
 
 
 def test_a_busy_child_is_never_idle(addon):
     queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
     until_running()
-    assert not memory.release_when_idle(time.monotonic() + 10_000)
+    assert not follow.release_when_idle(time.monotonic() + 10_000)
 
 
 def test_the_device_line_shows_what_is_known(addon):
-    assert memory.device_line() == "starts with the first human"
+    assert follow.device_line() == "starts with the first human"
     queue.info = {"device_name": "H200", "device_memory_gb": 139.8, "device_memory_free_gb": 120.04}
-    assert memory.device_line() == "H200, 139.8 GB, 120.0 GB free at its start"
+    assert follow.device_line() == "H200, 139.8 GB, 120.0 GB free at its start"
     queue.info = {"device_name": "CPU", "device_memory_gb": None, "memory_gb": 16.0, "memory_free_gb": None}
-    assert memory.device_line() == "CPU, 16.0 GB"
+    assert follow.device_line() == "CPU, 16.0 GB"
     queue.info = {"device_name": "CPU"}
-    assert memory.device_line() == "CPU"
+    assert follow.device_line() == "CPU"

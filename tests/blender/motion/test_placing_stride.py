@@ -12,12 +12,18 @@ from blender_primdiffusion.formats.poses.files import read_motion, write_amass
 from blender_primdiffusion.formats.poses.motion import Detected, Motion
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, joint_positions
 
-from blender_primdiffusion.motion.adjust import resample, rounds_of, scale_places, stride_ratio
+from blender_primdiffusion.motion.placing import (
+    FACTS,
+    Placement,
+    place_motion,
+    resample,
+    rounds_of,
+    scale_places,
+    stride_ratio,
+)
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui.motion_panel import built_in_motion
-from blender_primdiffusion.ui.motion_placing import Placement, place_motion
-from blender_primdiffusion.ui.on_person import FACTS
 
 pytestmark = pytest.mark.any_blender
 

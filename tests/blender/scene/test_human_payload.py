@@ -12,8 +12,16 @@ from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
 from blender_primdiffusion.jobs.volumes import faults
-from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human
-from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_file, session_folder
+from blender_primdiffusion.scene.human import (
+    BODY,
+    BODY_MARK,
+    PAYLOAD,
+    body_of,
+    humans,
+    is_human,
+    session_file,
+    session_folder,
+)
 
 ops = bpy.ops.primdiffusion
 ODD = 'Ä ö\' "x" 100%s 年'

@@ -11,9 +11,8 @@ from blender_primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.export_model import FrameRange, write_model
 from blender_primdiffusion.scene.handles import add_handles
-from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy
+from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy, write_model
 
 EXACT = 1e-4
 """Metres."""
@@ -48,7 +47,7 @@ def joints_and_vertices(armature, mesh):
 
 def at_frames(armature, mesh, frames):
     found = []
-    for frame in range(frames.first, frames.last + 1):
+    for frame in range(frames[0], frames[-1] + 1):
         bpy.context.scene.frame_set(frame)
         found.append(joints_and_vertices(armature, mesh))
     return found
@@ -73,7 +72,7 @@ def textures(mesh):
     return [node.image for node in nodes if node.type == "TEX_IMAGE" and node.image]
 
 
-@pytest.mark.parametrize("frames", [FrameRange(1, 4), FrameRange(3, 3)], ids=["animation", "pose"])
+@pytest.mark.parametrize("frames", [range(1, 5), range(3, 4)], ids=["animation", "pose"])
 @pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc"), ("USD", ".usdz")])
 def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, ending, frames):
     armature = moving
@@ -102,7 +101,7 @@ def test_textures_are_not_written_through_a_link(moving, store, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "textures").symlink_to(tmp_path / "outside")
     with refused(FileError, "textures"):
-        write_model(bpy.context, moving, proxy, tmp_path / "out" / "a.usdc", "USD", FrameRange(1, 1))
+        write_model(bpy.context, moving, proxy, tmp_path / "out" / "a.usdc", "USD", range(1, 2))
     assert not list((tmp_path / "outside").iterdir())
     assert not (tmp_path / "out" / "a.usdc").exists()
 
@@ -118,7 +117,7 @@ def test_ik_handles_are_not_exported_and_their_effect_is(store, tmp_path, kind, 
         armature.pose.bones["left_foot_ik"].keyframe_insert("location", frame=frame)
     proxy = build_proxy(person, read_proxy(store / "proxy.npz"), store / "proxy.png")
     bpy.context.scene.collection.objects.link(proxy)
-    frames = FrameRange(1, 4)
+    frames = range(1, 5)
     write_model(bpy.context, armature, proxy, tmp_path / f"a{ending}", kind, frames)
     wanted = at_frames(armature, proxy, frames)
     assert np.abs(wanted[0][0] - wanted[3][0]).max() > 0.1
@@ -135,7 +134,7 @@ def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
     bpy.context.scene.frame_set(2)
     kinds = ("scenes", "objects", "meshes", "armatures", "actions", "materials", "images", "collections")
     before = {kind: {obj.name for obj in getattr(bpy.data, kind)} for kind in kinds}
-    write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 4))
+    write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", range(1, 5))
     assert {kind: {obj.name for obj in getattr(bpy.data, kind)} for kind in kinds} == before
     assert bpy.context.scene.frame_current == 2
     assert armature.hide_viewport
@@ -148,7 +147,7 @@ def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, t
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png")
     addon_utils.disable("io_scene_fbx")
     try:
-        write_model(bpy.context, moving, proxy, tmp_path / "a.fbx", "FBX", FrameRange(1, 2))
+        write_model(bpy.context, moving, proxy, tmp_path / "a.fbx", "FBX", range(1, 3))
         assert (tmp_path / "a.fbx").is_file()
         assert not addon_utils.check("io_scene_fbx")[1]
     finally:
@@ -160,11 +159,11 @@ def test_an_armature_in_edit_mode_or_without_a_bone_is_rejected(moving, store, t
     armature = moving
     armature.data.bones["head"].name = "skull"
     with refused(ValueError, "'head'"):
-        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 1))
+        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", range(1, 2))
     armature.data.bones["skull"].name = "head"
     bpy.ops.object.mode_set(mode="EDIT")
     with refused(ValueError, "Edit Mode"):
-        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 1))
+        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", range(1, 2))
     assert not (tmp_path / "a.glb").exists()
 
 
