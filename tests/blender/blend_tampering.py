@@ -4,8 +4,6 @@
 changed outside of the folder beside the .blend. The tests try one property at a time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

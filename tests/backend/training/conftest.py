@@ -1,7 +1,5 @@
 """Humans to train on."""
 
-from __future__ import annotations
-
 import pytest
 from diffuse_runs import settings
 from diffusion_people import write_people

@@ -183,13 +183,6 @@ def test_a_picture_that_goes_missing_is_named(own, tmp_path, workers):
     assert sentence(error.value).startswith(str(own / "person_000001" / "img"))
 
 
-def test_a_mask_of_another_size_is_named(own, tmp_path):
-    for path in own.glob("person_000000/mask/*/*.png"):
-        Image.new("L", (30, 30)).save(path)
-    with refused(ValueError, "30 x 30 pixels"):
-        fit(settings(own, tmp_path / "run"))
-
-
 def test_a_human_on_another_body_is_named_before_training_begins(own, tmp_path):
     path = own / "person_000001" / "outputs_re_fitting"
     (plain,) = path.glob("*plain*.npz")

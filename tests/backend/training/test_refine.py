@@ -116,15 +116,6 @@ def test_masks_alone_make_a_thin_person_in_black_solid():
     assert torch.equal(without.density, thin.payload.density)
 
 
-def test_the_inputs_are_left_alone(views):
-    start = person(2)
-    before = start.map(torch.clone)
-    refine(start, views, dataclasses.replace(QUICK, steps=2))
-    assert torch.equal(start.payload.rgb, before.payload.rgb)
-    assert torch.equal(start.payload.density, before.payload.density)
-    assert not start.payload.rgb.requires_grad
-
-
 def test_the_work_ends_when_time_is_over_and_when_its_owner_says_so(views):
     assert refine(person(2), views, dataclasses.replace(QUICK, seconds=0)).steps == 1
 

@@ -1,7 +1,5 @@
 """The body in numpy: the backend's, to rounding."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import synthetic

@@ -1,7 +1,5 @@
 """Files of poses as people have them, and files that hold something else."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

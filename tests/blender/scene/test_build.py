@@ -1,7 +1,5 @@
 """The whole person in the scene: follows linear blend skinning, survives saving, undo and removal, fails cleanly."""
 
-from __future__ import annotations
-
 import itertools
 import json
 
@@ -9,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
-from human_files import folder_of, forget_session_files
+from human_files import folder_of
 from human_stage import strong_pose
 from mathutils import Matrix, Vector
 from oracle import TOLERANCE_M, evaluated_matrices, raised, surface_frames, world_from_model
@@ -21,7 +19,6 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
-from blender_primdiffusion.scene.volume_files import open_humans
 
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions", "images", "node_groups")
 
@@ -118,19 +115,6 @@ def test_provenance_and_overlaps_are_stored_on_the_collection(person):
     assert overlap_warning(collection) is None
     collection[MARK] = json.dumps({**stored, "most_overlapping": 40})
     assert "draws only 31" in overlap_warning(collection)
-
-
-def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):
-    collection, arrays = person
-    rotations, translation = strong_pose(1)
-    pose_from_joint_rotations(collection, rotations, translation)
-    bpy.ops.wm.save_mainfile()
-    forget_session_files()
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
-    assert open_humans() == []
-    collection = humans(bpy.context.scene)[0]
-    expected = expected_matrices(collection, arrays, rotations, translation)
-    np.testing.assert_allclose(evaluated_matrices(collection), expected, atol=2e-4)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "NaN"])

@@ -1,20 +1,26 @@
 """What Cycles shows: colours and opacity of the volumes, where the marcher's conventions put them."""
 
-from __future__ import annotations
+import json
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
+import synthetic_shape
 from scene_stage import render
 from support.errors import refused
 
 from benchmarks.cycles_preview import setup_cycles_preview
 from blender_primdiffusion.scene.armature import model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.cycles import posed_extent
+from blender_primdiffusion.scene.cycles import overlap_of, overlap_warning, posed_extent
+from blender_primdiffusion.scene.human import MARK
+from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volume_files import write_volumes
 from blender_primdiffusion.scene.volume_nodes import GAIN_NODE, MATERIAL_NAME
+from blender_primdiffusion.scene.volumes import max_overlap
+from blender_primdiffusion.ui.advanced_panel import details
 
 RED = (0.6, 0.1, 0.05)
 DENSITY = 20.0
@@ -100,3 +106,37 @@ def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path)
 def test_an_empty_scene_has_no_human_to_frame(empty_scene):
     with refused(ValueError, "human"):
         setup_cycles_preview(bpy.context.scene)
+
+
+COUNT = 96
+
+
+@pytest.fixture
+def source(tmp_path):
+    return synthetic_shape.write(tmp_path / "human", COUNT)
+
+
+@pytest.fixture
+def person(saved_scene, source):
+    return build_human(saved_scene, source)
+
+
+def counted(source, betas) -> int:
+    """From the file alone."""
+    human = read_human(source)
+    rest, growth = human.model.rest(betas), human.model.growth(human.payload.betas, betas)
+    offset, half = human.grids().drawn_box()
+    return max_overlap(
+        rest.position + np.einsum("kij,kj->ki", rest.rotation, growth * offset), rest.rotation, growth * half
+    )
+
+
+def test_the_count_is_that_of_the_boxes_as_they_were_made(person, source):
+    noted = json.loads(person[MARK])["most_overlapping"]
+    assert overlap_of(person) == noted == counted(source, generated_betas(person))
+    assert ("Volumes", f"up to {noted} overlap") in details(person)
+
+
+def test_a_note_changed_by_hand_is_no_warning(person):
+    person[MARK] = "nothing"
+    assert overlap_warning(person) is None

@@ -1,7 +1,5 @@
 """A human's file is in the .blend, byte for byte, wherever the armature goes: undo, saving, copies, libraries."""
 
-from __future__ import annotations
-
 import os
 import shutil
 
@@ -12,7 +10,7 @@ from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
 from blender_primdiffusion.jobs.volumes import faults
-from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human
+from blender_primdiffusion.scene.human import BODY_MARK, body_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_file, session_folder
 
 ops = bpy.ops.primdiffusion
@@ -102,19 +100,6 @@ def test_appended_and_linked(person, content, tmp_path, link):
     assert whole(named(), where)
 
 
-def test_a_library_override(person, content, tmp_path):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
-        wanted.collections = ["Anna"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    made = wanted.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
-    override = next(filter(is_human, made.all_objects))
-    assert held(override) == content
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
-    reopened(tmp_path / "film.blend")
-    assert held(next(one for one in humans(bpy.context.scene) if one.library is None)) == content
-
-
 @pytest.mark.parametrize("linked", [False, True], ids=["Shift-D", "Alt-D"])
 def test_blenders_duplicate_of_the_armature_shares_the_file_until_an_edit(person, content, linked):
     person.select_set(True)
@@ -130,17 +115,6 @@ def test_blenders_duplicate_of_the_armature_shares_the_file_until_an_edit(person
 def test_two_humans_of_the_same_body_hold_it_once(person, source):
     berta = build_posed(source, "Berta")
     assert berta[BODY] == person[BODY]
-
-
-def test_x_on_the_armature_and_undo(person, content):
-    bpy.ops.ed.undo_push(message="before")
-    person.select_set(True)
-    bpy.ops.object.delete()
-    bpy.ops.ed.undo_push(message="deleted")
-    assert not [obj for obj in bpy.data.objects if obj.type == "ARMATURE"]
-    bpy.ops.ed.undo()
-    assert held(named()) == content
-    assert whole(named())
 
 
 def test_unpacked_by_blender_the_file_is_the_same(person, content, tmp_path):
