@@ -26,7 +26,7 @@ def result(*arguments, **settings):
     return step.x0
 
 
-@pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
+@pytest.mark.parametrize("sampler", ["ddim", "ddpm", "dpmpp_2m"])
 def test_sampling_yields_every_step_down_to_a_clean_person(model, sampler):
     steps = list(sample(model, [0], 6, sampler))
     assert [(s.index, s.total, s.t) for s in steps] == [(i, 6, t) for i, t in enumerate(trailing_steps(1000, 6))]

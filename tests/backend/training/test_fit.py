@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from capture_scenes import captured
-from fit_scenes import STATE, WHOLE, files, flags, make_small, settings, stop_after
+from fit_scenes import STATE, WHOLE, files, flags, settings, stop_after
 from PIL import Image
 from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.reader import open_captures
@@ -26,17 +25,9 @@ from safetensors.torch import load_file
 from support.errors import refused
 from support.runs import rows, sentence
 
+pytestmark = pytest.mark.usefixtures("small_fit")
+
 ROOT = Path(__file__).parents[3]
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    make_small(monkeypatch)
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from capture_scenes import captured
 from fit_scenes import STATE, WHOLE, files, logged, make_small, settings, stop_after
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training import loop
@@ -23,10 +22,7 @@ from safetensors import safe_open
 from support.errors import refused
 from support.runs import same_tensors, sentence, timeless
 
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
+pytestmark = pytest.mark.usefixtures("small_fit")
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +33,6 @@ def whole(captures, tmp_path_factory):
         config = settings(captures, tmp_path_factory.mktemp("whole") / "run")
         fit(config)
         return config.run
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    make_small(monkeypatch)
 
 
 @pytest.fixture(scope="module")

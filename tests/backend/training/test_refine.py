@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from capture_scenes import body_mesh, captured, save_person
+from capture_scenes import body_mesh, save_person
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.capture.conditioning import conditioning_views
@@ -184,11 +184,6 @@ def test_cameras_are_held_out_evenly():
     assert sorted(held + given) == [0, 1, 2, 3, 4]
     with refused(ValueError, "0 to 3"):
         split_cameras(4, 4)
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("refined"), people=2, frames=2, passes=("img", "mask"))
 
 
 @pytest.fixture

@@ -99,11 +99,6 @@ def test_a_body_of_another_form_is_named(tmp_path, change, name):
         read_body(tmp_path / "body.npz")
 
 
-def test_a_missing_body_is_named(tmp_path):
-    with refused(FileError):
-        read_body(tmp_path / "none.npz")
-
-
 def rig_of(body, betas, off: float, seed: int = 0) -> dict[str, np.ndarray]:
     """Joints of a rig whose bones begin about `off` metres from the joints of the body."""
     joints = body.rest(betas)[1]

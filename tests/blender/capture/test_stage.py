@@ -99,16 +99,6 @@ def test_depth_is_what_rays_through_the_centres_of_pixels_meet(stage, which):
     assert np.median(off) < 1e-4
 
 
-def test_half_a_pixel_aside_depth_would_differ(stage):
-    person, view = put(stage), odd_view()
-    aside = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    shifted = View(view.intrinsics + aside, view.rotation, view.translation, 72, 48)
-    depth, _ = cast(person, shifted)
-    centres = shoot_centres(stage, view, seed=5)
-    both = np.isfinite(depth) & np.isfinite(centres.depth)
-    assert np.median(np.abs(depth[both] - centres.depth[both])) > 2e-3
-
-
 def test_parts_and_normals_are_those_of_the_faces_that_are_met(stage):
     person, view = put(stage), odd_view()
     centres = shoot_centres(stage, view, seed=1)

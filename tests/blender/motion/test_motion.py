@@ -107,7 +107,11 @@ def test_joints_of_a_skeleton_are_those_of_skinning():
     np.testing.assert_allclose(motion.joints()[0], expected, atol=1e-12)
 
 
-def test_a_motion_of_unlike_lengths_is_rejected():
+def test_counts_that_do_not_fit_are_rejected():
+    with refused(ValueError, "poses, not 21"):
+        built_in_poses(21)
+    with refused(ValueError, "20 poses"):
+        pick_poses([random_motion(3, 0)], 20)
     with refused(ValueError, "2 frames"):
         Motion(np.tile(np.eye(3), (2, 24, 1, 1)), np.zeros((3, 3)), 30.0, "x")
 
@@ -172,11 +176,6 @@ def test_no_built_in_pose_puts_a_hand_or_a_forearm_into_the_trunk():
         assert max(deep, default=0) < 0.02, name
 
 
-def test_more_poses_than_are_built_in_are_rejected():
-    with refused(ValueError, "poses, not 21"):
-        built_in_poses(21)
-
-
 def test_picked_poses_begin_near_t_and_are_spread_better_than_chance():
     clumsy = Motion(
         np.concatenate([np.tile(random_motion(1, 3).rotations, (80, 1, 1, 1)), built_in_poses(20).rotations]),
@@ -204,11 +203,6 @@ def test_the_same_seed_picks_the_same_poses_of_a_long_motion():
     first, second, other = (pick_poses([long], 6, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.rotations, second.rotations)
     assert not np.array_equal(first.rotations, other.rotations)
-
-
-def test_too_few_frames_are_rejected():
-    with refused(ValueError, "20 poses"):
-        pick_poses([random_motion(3, 0)], 20)
 
 
 def test_a_pose_does_not_depend_on_which_way_the_person_faces():
