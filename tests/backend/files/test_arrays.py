@@ -54,6 +54,13 @@ def assert_one_sentence(error: Exception, path) -> None:
         npy("'<f99'"),
         npy("'|O'"),
         npy(shape="(3,)", data=bytes(11)),
+        npy(shape="(True,)", data=bytes(4)),
+        npy(shape="(1.0,)", data=bytes(4)),
+        npy(shape="[1]", data=bytes(4)),
+        npy("'<c16'", data=bytes(48)),
+        npy("'<M8[s]'", data=bytes(24)),
+        npy("[('a', '<f4')]", data=bytes(12)),
+        npy("'<U1000000000'", "()", bytes(4)),
     ],
 )
 def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
@@ -168,3 +175,23 @@ def test_what_grows_beyond_the_limit_before_it_is_opened_is_not_read(tmp_path, m
     monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
     with pytest.raises(regular_files.FileError):
         regular_files.read_regular(path, 20)
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 99), (8, 12), (6, 1)], ids=["unknown", "bzip2", "encrypted"])
+def test_members_packed_in_another_way_are_rejected(tmp_path, offset, value):
+    path = npz(tmp_path / "poses.npz", npy(data=bytes(12)))
+    data = bytearray(path.read_bytes())
+    for mark, further in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):  # the member's two headers
+        place = data.find(mark) + offset + further
+        data[place : place + 2] = struct.pack("<H", value)
+    path.write_bytes(data)
+    with pytest.raises(FileError) as raised:
+        read_arrays(path, ("pose",))
+    assert_one_sentence(raised.value, path)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+def test_a_full_disk_is_one_error():
+    with refused(OSError, "space") as raised:
+        write_deflated("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
+    assert raised.value.__context__ is None or isinstance(raised.value.__context__, (OSError, ValueError))
