@@ -1,11 +1,11 @@
 """The line of works, with the real client and a child that can be told to misbehave."""
 
-import errno
+from __future__ import annotations
+
 import os
 import signal
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import bpy
 import pytest
@@ -14,9 +14,7 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LONG, request_of
 
-from blender_primdiffusion.backend.requests import RequestError
 from blender_primdiffusion.jobs import follow as follow_module
-from blender_primdiffusion.jobs import memory, remedies
 from blender_primdiffusion.jobs.follow import follow, watch
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -242,117 +240,3 @@ def test_progress_is_shown_once_beside_the_button_and_the_jobs_panel_tells_what_
     ]  # fmt: skip
     texts = shown(PRIMDIFFUSION_PT_jobs, addon)
     assert texts[:3] == [f"Human, seed {seed}" for seed in (TAKES_LONG, 11, FAILS)]
-
-
-def started_and_idle() -> int:
-    """The process id of a child that has made a person."""
-    queue.add(bpy.context, GenerateJob(7, {"steps": 1}))
-    drive()
-    return queue.child_pid
-
-
-def ended(pid: int, seconds: float = 300.0) -> bool:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        queue.listen()  # as a timer does
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def test_release_ends_the_child_and_the_next_job_starts_another(addon):
-    pid = started_and_idle()
-    assert ops.cancel(what="MEMORY") == {"FINISHED"}
-    assert ended(pid)
-    assert ops.cancel(what="MEMORY") == {"FINISHED"}, "without a child too"
-    assert started_and_idle() not in (pid, None)
-    assert len(humans(bpy.context.scene)) == 2
-    assert queue.child_message == ""
-
-
-def test_memory_is_not_released_while_the_child_is_busy(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
-    until_running()
-    with refused(RuntimeError, "backend"):
-        ops.cancel(what="MEMORY")
-    assert queue.busy
-
-
-def test_an_idle_child_is_ended_after_the_minutes_of_the_preferences(addon, monkeypatch):
-    pid = started_and_idle()
-    begun = queue.idle_since
-    assert memory.idle_minutes() == 10.0
-    assert not memory.release_when_idle(begun + 599)
-    monkeypatch.setattr(memory, "idle_minutes", lambda: 0.0)
-    assert not memory.release_when_idle(begun + 10_000)
-    monkeypatch.setattr(memory, "idle_minutes", lambda: 10.0)
-    assert memory.release_when_idle(begun + 601)
-    assert ended(pid)
-    assert not memory.release_when_idle(begun + 700), "nothing is left to end"
-
-
-@pytest.mark.parametrize("renders", [False, True])
-def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, monkeypatch, renders):
-    started_and_idle()
-    freed = []
-    monkeypatch.setattr(memory, "free_unused_grids", lambda: freed.append(1))
-    monkeypatch.setattr(memory, "idle_minutes", lambda: 10.0)
-    monkeypatch.setattr(memory, "bpy", SimpleNamespace(app=SimpleNamespace(is_job_running=lambda _: renders)))
-    assert memory.release_when_idle(queue.idle_since + 601)
-    assert len(freed) == (0 if renders else 1)
-
-
-def test_a_busy_child_is_never_idle(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
-    until_running()
-    assert not memory.release_when_idle(time.monotonic() + 10_000)
-
-
-def test_the_device_line_shows_what_is_known(addon):
-    assert memory.device_line() == "starts with the first human"
-    queue.info = {"device_name": "H200", "device_memory_gb": 139.8, "device_memory_free_gb": 120.04}
-    assert memory.device_line() == "H200, 139.8 GB, 120.0 GB free at its start"
-    queue.info = {"device_name": "CPU", "device_memory_gb": None, "memory_gb": 16.0, "memory_free_gb": None}
-    assert memory.device_line() == "CPU, 16.0 GB"
-    queue.info = {"device_name": "CPU"}
-    assert memory.device_line() == "CPU"
-
-
-def test_each_error_has_a_button_where_there_is_something_to_do(addon):
-    for kind in ("died", "hung", "busy", "timeout"):
-        assert remedies.remedy_for(RequestError("", "", kind)) is None
-    assert remedies.remedy_for(RequestError("", "", "out_of_memory")).properties == {"what": "MEMORY"}
-    assert remedies.remedy_for(RequestError("", "", "unwritable")).operator == "wm.save_as_mainfile"
-    no_checkpoint = RequestError("there is no checkpoint at 'x.safetensors'", "", "missing_file")
-    assert remedies.remedy_for(no_checkpoint).operator == "preferences.addon_show"
-    assert remedies.remedy_for(RequestError("there is no folder of captures 'x'", "", "missing_file")) is None
-    assert remedies.remedy_for(RequestError("", "", "bad_input")) is None
-    assert remedies.remedy_for(RequestError("", "", "environment")).operator == "primdiffusion.set_up_backend"
-
-
-def test_the_panel_shows_the_error_its_button_and_the_log(addon):
-    with pytest.raises(RuntimeError):
-        ops.generate(seed=NO_MEMORY)
-    texts = shown(PRIMDIFFUSION_PT_generate, addon)
-    assert {"primdiffusion.cancel", "wm.path_open"} <= set(texts)
-
-
-def test_the_log_holds_versions_and_the_error(addon):
-    with pytest.raises(RuntimeError):
-        ops.generate(seed=FAILS)
-    text = remedies.error_log().read_text(encoding="utf-8")
-    for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
-        assert part in text
-    assert str(Path.home()) not in text
-
-
-def test_a_full_disk_is_a_kind_of_its_own(addon):
-    full = OSError(errno.ENOSPC, "No space left on device", "x.vdb")
-    wrapped = RuntimeError("the volumes cannot be written")
-    wrapped.__cause__ = full
-    for error in (full, wrapped):
-        assert remedies.error_in_the_scene(error).kind == "unwritable"
-    assert remedies.error_in_the_scene(ValueError("no")).kind == "scene"

@@ -1,5 +1,7 @@
 """Rotations, skeletons, our own poses, and picking poses out of motion."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 import synthetic
@@ -18,10 +20,7 @@ from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joi
 from support.errors import refused
 
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.motion.adjust import rounds_of
 from blender_primdiffusion.motion.poses import FLOOR, built_in_poses, pick_poses
-from blender_primdiffusion.ui.motion_panel import built_in_motion
-from scripts.bake_poses import motions
 from scripts.bake_poses.poses import BUILT_IN
 
 pytestmark = pytest.mark.any_blender
@@ -107,11 +106,7 @@ def test_joints_of_a_skeleton_are_those_of_skinning():
     np.testing.assert_allclose(motion.joints()[0], expected, atol=1e-12)
 
 
-def test_counts_that_do_not_fit_are_rejected():
-    with refused(ValueError, "poses, not 21"):
-        built_in_poses(21)
-    with refused(ValueError, "20 poses"):
-        pick_poses([random_motion(3, 0)], 20)
+def test_a_motion_of_unlike_lengths_is_rejected():
     with refused(ValueError, "2 frames"):
         Motion(np.tile(np.eye(3), (2, 24, 1, 1)), np.zeros((3, 3)), 30.0, "x")
 
@@ -176,6 +171,11 @@ def test_no_built_in_pose_puts_a_hand_or_a_forearm_into_the_trunk():
         assert max(deep, default=0) < 0.02, name
 
 
+def test_more_poses_than_are_built_in_are_rejected():
+    with refused(ValueError, "poses, not 21"):
+        built_in_poses(21)
+
+
 def test_picked_poses_begin_near_t_and_are_spread_better_than_chance():
     clumsy = Motion(
         np.concatenate([np.tile(random_motion(1, 3).rotations, (80, 1, 1, 1)), built_in_poses(20).rotations]),
@@ -205,6 +205,11 @@ def test_the_same_seed_picks_the_same_poses_of_a_long_motion():
     assert not np.array_equal(first.rotations, other.rotations)
 
 
+def test_too_few_frames_are_rejected():
+    with refused(ValueError, "20 poses"):
+        pick_poses([random_motion(3, 0)], 20)
+
+
 def test_a_pose_does_not_depend_on_which_way_the_person_faces():
     motion = random_motion(40, 6, 0.2)
     turned = np.array(motion.rotations)
@@ -217,87 +222,3 @@ def test_joint_positions_move_with_the_translation():
     rotations = random_motion(2, 8).rotations
     moved = joint_positions(rotations, np.array([[1.0, 2, 3], [0, 0, 0]]))
     np.testing.assert_allclose(moved[0] - joint_positions(rotations)[0], np.tile([1.0, 2, 3], (24, 1)))
-
-
-SECONDS = {"WALK": 1.1, "IDLE": 6.0, "WAVE": 3.0, "TURN": 2.4}
-
-
-ANKLES = [JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]
-
-
-KNEES = [JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("right_knee")]
-
-
-FEET = [JOINT_NAMES.index("left_foot"), JOINT_NAMES.index("right_foot")]
-
-
-def turns(motion) -> np.ndarray:
-    """Degrees of each joint from frame to frame."""
-    between = np.swapaxes(motion.rotations[:-1], -1, -2) @ motion.rotations[1:]
-    return np.degrees(np.linalg.norm(to_axis_angle(between), axis=-1))
-
-
-@pytest.mark.parametrize("name", SECONDS)
-def test_the_file_is_what_the_script_makes(name):
-    motion, made = built_in_motion(name), getattr(motions, name.lower())()
-    np.testing.assert_allclose(motion.rotations, made.rotations, atol=1e-6)
-    np.testing.assert_allclose(motion.translations, made.translations, atol=1e-6)
-    assert motion.fps == made.fps
-
-
-@pytest.mark.parametrize("name", ["WALK", "IDLE", "WAVE"])
-def test_a_loops_end_is_its_beginning(name):
-    motion = built_in_motion(name)
-    np.testing.assert_allclose(motion.rotations[-1], motion.rotations[0], atol=1e-6)
-    moved = motion.translations[-1] - motion.translations[0]
-    np.testing.assert_allclose(moved[:2], 0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", SECONDS)
-def test_rounds_take_the_seconds_they_say_and_no_joint_jumps(name):
-    motion = rounds_of(built_in_motion(name), 3)
-    assert (len(motion) - 1) / motion.fps == pytest.approx(3 * SECONDS[name])
-    assert turns(motion).max() * motion.fps < 60 * 14
-    assert np.linalg.norm(np.diff(motion.translations, axis=0), axis=-1).max() * motion.fps < 60 * 0.03
-
-
-@pytest.mark.parametrize("name", SECONDS)
-def test_feet_neither_sink_into_the_floor_nor_float(name):
-    joints = rounds_of(built_in_motion(name), 2).joints()
-    ball = joints[:, FEET, 1] - (REST_JOINTS[FEET[0], 1] - FLOOR)
-    assert (ball.min(1) > FLOOR - 0.025).all()
-    heel = joints[:, ANKLES, 1] - (REST_JOINTS[ANKLES[0], 1] - FLOOR)
-    assert (np.minimum(ball, heel).min(1) < FLOOR + 0.03).all()
-
-
-def test_walking_feet_do_not_slide():
-    motion = rounds_of(built_in_motion("WALK"), 2)
-    joints = motion.joints()
-    for foot, ankle in zip(FEET, ANKLES, strict=True):
-        flat = np.abs(joints[:, foot, 1] - REST_JOINTS[foot, 1]) < 0.002
-        flat &= np.abs(joints[:, ankle, 1] - REST_JOINTS[ankle, 1]) < 0.002
-        both = flat[1:] & flat[:-1]
-        assert both.mean() > 0.2
-        assert np.linalg.norm(np.diff(joints[:, [foot, ankle]][..., [0, 2]], axis=0)[both], axis=-1).max() < 1e-3
-        swings = np.diff(joints[:, foot, 2]) * motion.fps > 0.6
-        assert swings.mean() < 0.45
-        assert joints[1:][swings][:, foot, 1].min() > REST_JOINTS[foot, 1] - 0.012  # the toes' joint, heel high
-
-
-def test_walking_goes_forward_and_knees_bend_forward():
-    motion = rounds_of(built_in_motion("WALK"), 2)
-    assert motion.translations[-1, 2] - motion.translations[0, 2] == pytest.approx(2.56)
-    world = chain(motion.rotations)
-    for knee in KNEES:
-        turn = to_axis_angle(motion.rotations[:, knee])
-        assert (turn[:, 0] > -1e-3).all()
-        assert np.degrees(turn[:, 0]).max() > 45
-    assert (world[:, 0, 2, 2] > 0.98).all()
-
-
-def test_turning_is_a_quarter_to_the_left_each_round():
-    motion = rounds_of(built_in_motion("TURN"), 2)
-    facing = motion.rotations[[0, len(motion) // 2, -1], 0, :, 2]
-    np.testing.assert_allclose(facing, [[0, 0, 1], [1, 0, 0], [0, 0, -1]], atol=0.06)
-    standing = motion.joints()[[0, -1]][:, ANKLES]
-    np.testing.assert_allclose(standing.mean(1)[0], standing.mean(1)[1], atol=0.06)

@@ -1,5 +1,7 @@
 """The panels Render and Advanced as the user meets them, with the real client and a child that merges small grids."""
 
+from __future__ import annotations
+
 import bpy
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.scene.representation import representation_of, show_in_viewport
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
-from blender_primdiffusion.ui import advanced_panel, menus, preferences, render_panel
+from blender_primdiffusion.ui import advanced_panel, preferences, render_panel
 
 ops = bpy.ops.primdiffusion
 
@@ -240,29 +242,3 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
         assert 0 < y < 1
         assert depth > 0
     assert any(light.type == "SUN" for light in bpy.data.lights)
-
-
-def offered(monkeypatch, named: bool, state: str = "ready") -> list[str]:
-    """Operators of Add > Human, with and without a backend, and a Python that runs it."""
-    monkeypatch.setattr(menus, "backend_is_named", lambda: named)
-    monkeypatch.setattr(menus, "known", lambda: preferences.Known(state, ""))
-    return shown(menus.PRIMDIFFUSION_MT_add, bpy.context)
-
-
-@pytest.mark.parametrize("named", [True, False])
-def test_add_human_offers_what_works_with_and_without_a_backend(addon, monkeypatch, named):
-    always = ["primdiffusion.import_human"] * 2  # a sample, a file
-    with_backend = ["primdiffusion.generate", "primdiffusion.choose_picture"]
-    assert offered(monkeypatch, named) == (with_backend + always if named else always)
-    unready = offered(monkeypatch, named, "absent")
-    assert unready == (["preferences.addon_show", *always] if named else always)
-
-
-def test_the_entries_come_and_go_with_the_extension(addon):
-    assert menus.draw_add in bpy.types.VIEW3D_MT_add._dyn_ui_initialize()
-    assert menus.draw_import in bpy.types.TOPBAR_MT_file_import._dyn_ui_initialize()
-    menus.unregister()
-    try:
-        assert menus.draw_add not in bpy.types.VIEW3D_MT_add._dyn_ui_initialize()
-    finally:
-        menus.register()

@@ -1,8 +1,9 @@
 """Set Up Backend and its neighbours as operators: what they do, what they refuse, what panels show."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import bpy
 import pytest
@@ -140,6 +141,11 @@ def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
     assert known().state == "outdated"  # still there, and it works
 
 
+def test_nothing_to_cancel_is_rejected(wheels):
+    with refused(RuntimeError, "nothing"):
+        press.cancel(what="SET_UP")
+
+
 def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, tmp_path, monkeypatch):
     with served(online, stalls="torch") as (index, handler):
         own_index(monkeypatch, index)
@@ -223,27 +229,3 @@ def test_the_zip_holds_the_locks_and_asks_for_the_network():
     manifest = (build_addon.ADDON / "blender_manifest.toml").read_text()
     reason = re.search(r'^network = "(.+)"$', manifest, re.MULTILINE)
     assert len(reason[1]) <= 64
-
-
-@pytest.fixture
-def alone(addon, monkeypatch):
-    """The viewer, and no backend anywhere."""
-    monkeypatch.delenv(VARIABLE, raising=False)
-    monkeypatch.setattr(preferences, "setup", None)
-    monkeypatch.setattr(preferences, "_own_python_will_do", lambda: False)
-    monkeypatch.setattr(preferences, "installed_backend", lambda: None)
-
-
-def test_without_a_backend_the_panel_says_what_to_do_and_opens_the_preferences(alone):
-    layout = MagicMock()
-    assert not preferences.draw_set_up(layout)
-    assert layout.box().operator.call_args.args == ("preferences.addon_show",)
-    assert preferences.known().line.startswith("There is no backend on this computer: install")
-
-
-def test_a_program_on_the_path_is_found_and_one_in_the_preferences_goes_first(alone, monkeypatch):
-    monkeypatch.setattr(preferences, "installed_backend", lambda: Path("/opt/primdiffusion"))
-    assert preferences.draw_set_up(MagicMock())
-    assert preferences.known().line == "Uses /opt/primdiffusion, named by the PATH"
-    monkeypatch.setattr(preferences, "preference", lambda _name: "/mine/bin/python")
-    assert preferences.known().line == "Uses /mine/bin/python, named by the extension's preferences"

@@ -1,0 +1,167 @@
+"""The mixture over person components: which kinds of people it knows, and where it puts them."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
+from primdiffusion.diffusion.gaussian import IMPOSSIBLE
+from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.prior import fit_mixture
+
+WORDS = AttributeVocabulary(
+    {
+        "sex": ("female", "male"),
+        "outfit": ("dress", "jeans"),
+        "hair": ("bob", "crew", "long"),
+        "shoes": ("boots", "pumps"),
+    },
+    {"height": (1.7, 0.1)},
+)
+CONFIG = PriorConfig(lean=0.4, axes=4, shared=1)
+DRESS = {"sex": "female", "outfit": "dress"}
+PEOPLE = [
+    *[{**DRESS, "hair": "bob", "shoes": "boots"}] * 300,
+    *[{**DRESS, "hair": "long", "shoes": "boots"}] * 100,
+    *[{"sex": "female", "outfit": "jeans", "hair": "bob", "shoes": "pumps"}] * 200,
+    *[{"sex": "male", "outfit": "jeans", "hair": "crew", "shoes": "boots"}] * 400,
+]
+CLOTHES = 5
+"""Components of the clothes; of the other two, the first is the hands' and the second the head's."""
+
+
+def components(spread=0.1):
+    """Of PEOPLE: the outfit moves the first, long hair the second, pumps the third; jeans vary in the fourth, and long
+    hair in the last. A tone of the skin is in the hands, in the head and, of dresses alone, in the fifth."""
+    generator = torch.Generator().manual_seed(0)
+    c = spread * torch.randn(len(PEOPLE), CLOTHES + 2, generator=generator)
+    for row, skin, person in zip(c, torch.randn(len(PEOPLE), generator=generator), PEOPLE, strict=True):
+        row[0] += 10 * (person["outfit"] == "jeans")
+        row[1] += 5 * (person["hair"] == "long")
+        row[2] += 3 * (person["shoes"] == "pumps")
+        row[3] *= 20 if person["outfit"] == "jeans" else 1
+        row[6] *= 10 if person["hair"] == "long" else 1
+        row[4] += 2 * skin * (person["outfit"] == "dress")
+        row[5:] += torch.stack([skin, 3 * skin])
+    return c
+
+
+@pytest.fixture(scope="module")
+def mixture():
+    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in PEOPLE])
+    return SimpleNamespace(**fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG))
+
+
+def part(mixture, **asked):
+    """Where the part of a kind is."""
+    wanted = WORDS.encode(asked)
+    places = ((mixture.kind * wanted).sum(-1) == len(asked)).nonzero().tolist()
+    assert len(places) == 1
+    return tuple(places[0])
+
+
+def test_kinds_are_all_that_can_be_put_together_and_weights_sum_to_one(mixture):
+    real = mixture.log_weight > IMPOSSIBLE / 2
+    assert mixture.log_weight.exp().sum().item() == pytest.approx(1, abs=1e-5)
+    # two groups of women with two hair styles, one of men with one; two pairs of shoes each
+    assert real.sum() == 2 * 2 * 2 + 1 * 2
+    assert mixture.log_weight.shape == (3, 4)
+    assert not mixture.kind[..., WORDS.blocks()["hair"]][~real].any()
+
+
+def test_no_human_gets_the_hair_of_the_other_sex(mixture):
+    male, crew = WORDS.encode({"sex": "male"}), WORDS.encode({"hair": "crew"})
+    assert torch.equal((mixture.kind @ male).bool(), (mixture.kind @ crew).bool())
+
+
+def test_an_unseen_kind_is_the_sum_of_the_effects_of_its_attributes(mixture):
+    # nobody wears jeans and pumps with long hair
+    new = part(mixture, sex="female", outfit="jeans", hair="long", shoes="pumps")
+    assert torch.allclose(mixture.centre[new][:3], torch.tensor([10.0, 5.0, 3.0]), atol=0.8)
+    seen = part(mixture, **DRESS, hair="bob", shoes="boots")
+    assert torch.allclose(mixture.centre[seen][:3], torch.zeros(3), atol=0.3)
+
+
+def test_shares_are_those_of_the_people_given_the_sex(mixture):
+    share = mixture.log_weight[part(mixture, **DRESS, hair="long", shoes="boots")].exp().item()
+    women_with_long_hair, with_boots = 100 / 600, 800 / 1000
+    assert share == pytest.approx(0.4 * women_with_long_hair * with_boots, rel=1e-4)
+
+
+def test_groups_keep_their_own_variance(mixture):
+    spread = [
+        variances(mixture.axes[group], mixture.variance[group], mixture.left[group])[3]
+        for group in (part(mixture, **DRESS, hair="bob", shoes="boots")[0],
+                      part(mixture, sex="male", outfit="jeans", hair="crew", shoes="boots")[0])
+    ]  # fmt: skip
+    assert spread[1].item() == pytest.approx(4.0, rel=0.3)
+    assert spread[0] < 0.1
+
+
+def variances(axes, variance, left):
+    return torch.einsum("i,ij,ij->j", variance - left, axes, axes) + left
+
+
+def test_heads_keep_the_variance_of_their_hair(mixture):
+    spread = []
+    for hair in ("long", "bob"):
+        head = mixture.head[part(mixture, **DRESS, hair=hair, shoes="boots")]
+        spread.append(variances(mixture.head_axes[head], mixture.head_variance[head], mixture.head_left[head])[1])
+    assert spread[0].item() == pytest.approx(1.0, rel=0.3)
+    assert spread[1] < 0.2
+
+
+def fitted(people, c, config=CONFIG):
+    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in people])
+    return SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, config))
+
+
+def test_what_happens_to_go_with_hair_and_skin_does_not_colour_clothes():
+    few = [{**DRESS, "hair": hair, "shoes": "boots"} for hair in ("bob",) * 20 + ("long",) * 5]
+    c = torch.randn(len(few), CLOTHES + 2, generator=torch.Generator().manual_seed(1))
+    mixture = fitted(few, c)
+    bob, long = (part(mixture, **DRESS, hair=hair, shoes="boots") for hair in ("bob", "long"))
+    by_chance = (c[20:] - c[:20].mean(0)).mean(0)[:CLOTHES].square().sum()
+    assert (mixture.centre[long] - mixture.centre[bob])[:CLOTHES].square().sum() < 0.3 * by_chance
+    assert mixture.shared[0, 0, :CLOTHES].square().sum() < 0.2
+
+
+def test_the_variance_is_that_of_the_people_however_little_of_it_is_explained():
+    few = [{**DRESS, "hair": hair, "shoes": shoes} for hair in ("bob", "long") for shoes in ("boots", "pumps")] * 10
+    for seed in range(5):
+        c = torch.randn(len(few), CLOTHES + 2, generator=torch.Generator().manual_seed(seed))
+        mixture = fitted(few, c)
+        weight = mixture.log_weight[0].exp()
+        mean = weight @ mixture.centre[0]
+        spread = weight @ (mixture.centre[0] - mean).square() + mixture.shared[0].square().sum(0)
+        spread[:CLOTHES] += variances(mixture.axes[0], mixture.variance[0], mixture.left[0])
+        assert spread[:CLOTHES].sum() == pytest.approx(c[:, :CLOTHES].square().mean(0).sum().item(), rel=0.1)
+
+
+def test_the_other_sex_in_the_same_garments_counts_by_half():
+    women, men = [PEOPLE[400]] * 10, [PEOPLE[-1]] * 40
+    c = 0.01 * torch.randn(50, CLOTHES + 2, generator=torch.Generator().manual_seed(0))
+    c[10:, 3] *= 200
+    mixture = fitted(women + men, c, PriorConfig(lean=0.0, axes=4, shared=1))
+    women_s, men_s = (variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[3].item() for g in range(2))
+    assert women_s == pytest.approx(4 * 20 / (10 + 20), rel=0.3)
+    assert men_s == pytest.approx(4 * 40 / (40 + 5), rel=0.3)
+
+
+def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
+    dress, jeans = (
+        mixture.shared[part(mixture, sex="female", outfit=outfit, hair="bob", shoes="boots")[0], 0]
+        for outfit in ("dress", "jeans")
+    )
+    sign = dress[5].sign()
+    assert torch.allclose(sign * dress[4:], torch.tensor([2.0, 1.0, 3.0]), rtol=0.1)
+    assert jeans[4].abs() < 0.2
+    assert torch.equal(jeans[5:], dress[5:])
+    assert mixture.axes.shape == (3, 4, CLOTHES)
+    assert mixture.head_axes.shape == (3, 2, 2)
+
+
+def test_people_of_whom_nothing_is_known_are_one_gaussian():
+    mixture = SimpleNamespace(**fit_mixture(components(), CLOTHES, torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG))
+    assert mixture.log_weight.shape == (1, 1)
+    assert torch.allclose(mixture.centre[0, 0], components().mean(0), atol=0.1)

@@ -1,0 +1,35 @@
+"""Blender's own menus offer what works."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+from jobs_driven import shown
+
+from blender_primdiffusion.ui import menus, preferences
+
+
+def offered(monkeypatch, named: bool, state: str = "ready") -> list[str]:
+    """Operators of Add > Human, with and without a backend, and a Python that runs it."""
+    monkeypatch.setattr(menus, "backend_is_named", lambda: named)
+    monkeypatch.setattr(menus, "known", lambda: preferences.Known(state, ""))
+    return shown(menus.PRIMDIFFUSION_MT_add, bpy.context)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_add_human_offers_what_works_with_and_without_a_backend(addon, monkeypatch, named):
+    always = ["primdiffusion.import_human"] * 2  # a sample, a file
+    with_backend = ["primdiffusion.generate", "primdiffusion.choose_picture"]
+    assert offered(monkeypatch, named) == (with_backend + always if named else always)
+    unready = offered(monkeypatch, named, "absent")
+    assert unready == (["preferences.addon_show", *always] if named else always)
+
+
+def test_the_entries_come_and_go_with_the_extension(addon):
+    assert menus.draw_add in bpy.types.VIEW3D_MT_add._dyn_ui_initialize()
+    assert menus.draw_import in bpy.types.TOPBAR_MT_file_import._dyn_ui_initialize()
+    menus.unregister()
+    try:
+        assert menus.draw_add not in bpy.types.VIEW3D_MT_add._dyn_ui_initialize()
+    finally:
+        menus.register()
