@@ -27,7 +27,7 @@ sys.path[:0] = [
     str(TESTS / folder) for folder in (".", "backend", "backend/released", "backend/evaluation")
 ]  # the references
 
-import test_pose_depth_network_metrics  # noqa: E402
+import test_pose_depth_network  # noqa: E402
 import test_stage_one_twin  # noqa: E402
 import test_torch_fidelity  # noqa: E402
 import test_unet_twin  # noqa: E402
@@ -69,7 +69,7 @@ def measure(assets: Path | None) -> dict[str, float | int | None]:
         "stage1_error_max": test_stage_one_twin.stage_one_error(),
         "importer_unaccounted": unaccounted(),
         "fid_equal_error": fid_error,
-        "pck_synthetic_error": test_pose_depth_network_metrics.pck_error(),
+        "pck_synthetic_error": test_pose_depth_network.pck_error(),
         "table1_minutes_cpu_quick": None if assets is None else round(table_minutes(assets), 2),
     }
 

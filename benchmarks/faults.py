@@ -1,8 +1,8 @@
-"""What hostile files, kills, full disks and dead children do, and whether a seed is the same human everywhere.
+"""What hostile files do, and whether a seed is the same human everywhere.
 
     export PRIMDIFFUSION_ASSETS=DIR
     python benchmarks/faults.py --json docs/results/faults.json --window window_out/figures.json
-    python benchmarks/faults.py --json docs/results/faults.json --parts kills    # the file's other figures are kept
+    python benchmarks/faults.py --json docs/results/faults.json --parts blends   # the file's other figures are kept
 
 Each part is written as soon as it is measured, with `PART_recorded`: version, commit and date. The parts are
 
@@ -14,9 +14,6 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
 - attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
   tests in ATTACKS: how many there are, and how many did no harm; writers: how many of 200 results of two processes that
   write into one folder at once are mixed (`tests/backend/two_writers.py`)
-- kills: of the programs in KILLED, in as many processes as there are cores, at most two; a loss is a file that is
-  half-written, gone, set back, or other than that of an undisturbed run. disks, deaths (of the extension's child) and
-  environments are `tests/chaos` too
 - rigs: motions and scans of the default body as a Mixamo, Ready Player Me, Rokoko, VRoid and SOMA rig: how many are
   read and stand, and the largest error of a scan's size as a fraction (`tests/blender/real_rigs.py`)
 - window: rounds of undo and redo among timers in a real window, and crashes, from the figures of
@@ -26,11 +23,9 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
 import dataclasses
 import itertools
 import json
-import math
 import os
 import re
 import subprocess
@@ -49,13 +44,10 @@ TESTS = ROOT / "tests"
 SEED = 7
 THREADS = (1, 2, 4)
 BATCHES = (1, 8)
-KILLED = ("captures render", "captures pack", "train", "fit", "payloads", "payloads encode",
-          "export .glb", "export .obj", "export .ply")  # fmt: skip
-"""Programs that write what took long, as `tests/chaos/programs.py` names them."""
 ATTACKS = (
-    "tests/contract/test_setup_choice.py::test_only_whole_lines_of_a_requirement_or_an_index_are_read",
-    "tests/contract/test_setup_choice.py::test_a_second_index_is_refused",
-    "tests/contract/test_setup_choice.py::test_pip_gets_no_line_that_was_not_read",
+    "tests/contract/test_setup_environment.py::test_only_whole_lines_of_a_requirement_or_an_index_are_read",
+    "tests/contract/test_setup_environment.py::test_a_second_index_is_refused",
+    "tests/contract/test_setup_environment.py::test_pip_gets_no_line_that_was_not_read",
     "tests/contract/test_setup_environment.py::test_a_web_page_among_the_wheels_is_named_before_anything_is_made",
     "tests/backend/capture/test_farm.py::test_a_subject_that_would_be_an_option_or_a_path_is_handed_to_no_renderer",
     "tests/backend/capture/test_render.py::test_no_worker_writes_through_a_link_in_the_folder_of_a_human",
@@ -88,8 +80,6 @@ class Part:
 def main() -> None:
     parser = record.command_line(__doc__)
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="measure only these anew; all by default")
-    parser.add_argument("--kills", type=int, default=300)
-    parser.add_argument("--deaths", type=int, default=1000, help="of the child")
     parser.add_argument("--steps", type=int, default=30, help="of the sampler")
     parser.add_argument("--window", type=Path, help="figures.json of scripts/window/look.py")
     arguments = parser.parse_args()
@@ -163,28 +153,11 @@ def numbers(human: Human) -> dict[str, torch.Tensor]:
     return {name: tensor.double() for name, tensor in tensors.items() if tensor.max() > tensor.min()}
 
 
-def kills(count: int) -> dict[str, Figure]:
-    """The figures of all processes together, each with moments of its own."""
-    processes = min(os.cpu_count() or 1, 2)
-    each = ["--kills", str(math.ceil(count / processes)), "--only", *KILLED]
-    with concurrent.futures.ThreadPoolExecutor(processes) as pool:
-        seeds = range(processes)
-        found = list(pool.map(lambda seed: chaos("kills", "--seed", str(seed), *each), seeds))
-    return {name: sum(int(one[name] or 0) for one in found) for name in PARTS["kills"].figures}
-
-
 def attacks() -> dict[str, Figure]:
     """The attacks that were tried, and those that did no harm. Ends with a sentence where a test is gone."""
     said = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *ATTACKS, is_shown=False).splitlines()[-1]
     counts = {outcome: int(number) for number, outcome in re.findall(r"(\d+) (passed|failed|errors?)", said)}
     return {"attack_cases": sum(counts.values()), "attack_cases_held": counts.get("passed", 0)}
-
-
-def chaos(attack: str, *options: str) -> dict[str, Figure]:
-    with tempfile.TemporaryDirectory(prefix="primdiffusion_faults_") as name:
-        figures = Path(name) / "figures.json"
-        run("-m", "tests.chaos", "--attacks", attack, "--json", str(figures), *options)
-        return json.loads(figures.read_text(encoding="utf-8"))
 
 
 def window(path: Path) -> dict[str, Figure]:
@@ -235,13 +208,6 @@ PARTS: dict[str, Part] = {
     ),
     "attacks": Part(("attack_cases", "attack_cases_held"), lambda _: attacks()),
     "writers": Part(("two_writers_mixed",), lambda _: tool("tests/backend/two_writers.py", "--rounds", "200")),
-    "kills": Part(("kills", "kills_lost"), lambda given: kills(given.kills)),
-    "deaths": Part(
-        ("child_deaths", "child_deaths_lost", "child_hangs"),
-        lambda given: chaos("deaths", "--deaths", str(given.deaths)),
-    ),
-    "disks": Part(("disk_full_commands", "disk_full_losses"), lambda _: chaos("disks")),
-    "environments": Part(("environments", "environments_failed"), lambda _: chaos("environments")),
     "rigs": Part(
         ("real_rigs", "real_rigs_read", "real_rigs_upright", "capture_scale_error_max"),
         lambda _: tool("tests/blender/real_rigs.py", is_shown=False),

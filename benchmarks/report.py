@@ -81,9 +81,6 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("FID, largest difference to another implementation", "faithful", "fid_equal_error", ""),
         ("hostile files and settings that were held", "faults", "attack_cases_held", ""),
         ("of", "faults", "attack_cases", ""),
-        ("programs killed while they wrote; results lost", "faults", "kills_lost", ""),
-        ("backends killed while Blender waited; jobs that hung", "faults", "child_hangs", ""),
-        ("commands on a full disk; files lost", "faults", "disk_full_losses", ""),
         ("tests under Windows' file rules that fail", "everywhere", "tests_failing_under_windows_rules", ""),
     ),
 }

@@ -6,7 +6,7 @@
 
 `make demo`, `make test` and so on call it. It needs Python 3.11 and nothing else; each environment is a folder in the
 checkout (.venv, .venv52, .venv53), and nothing else on the machine is touched. Environment variables: PYTHON313,
-TEST_ARGS, MINUTES (see `help`).
+TEST_ARGS (see `help`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ ROOT = Path(__file__).resolve().parents[1]
 WINDOWS = os.name == "nt"
 BY_MAKE = "MAKELEVEL" in os.environ
 TEST_ARGS = shlex.split(os.environ.get("TEST_ARGS", ""))
-MINUTES = os.environ.get("MINUTES") or "30"
 VENV, VENV52, VENV53 = ROOT / ".venv", ROOT / ".venv52", ROOT / ".venv53"
 """One environment for each Blender, which is a Python module: 5.0, 5.2 and 5.3."""
 MEGABYTES = {VENV: 3700, VENV52: 1300, VENV53: 1300}
@@ -114,12 +113,6 @@ def test_all(arguments: Sequence[str]) -> None:
     run([program(VENV), "-m", "pytest", "-m", "not gpu", *TEST_ARGS, *arguments])
 
 
-def chaos(arguments: Sequence[str]) -> None:
-    """kill programs, fill disks, break environments for MINUTES=30; see tests/chaos"""
-    ready_to_test()
-    run([program(VENV), "-m", "tests.chaos", "--minutes", MINUTES, *arguments], **ONE_THREAD)
-
-
 def lint(_: Sequence[str]) -> None:
     """ruff, import contracts, types"""
     ready_to_test()
@@ -155,7 +148,6 @@ TARGETS: dict[str, Callable[[Sequence[str]], None]] = {
     "test-5.2": test_52,
     "test-5.3": test_53,
     "test-all": test_all,
-    "chaos": chaos,
     "lint": lint,
     "types": types,
     "setup": setup,

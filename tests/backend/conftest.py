@@ -1,7 +1,5 @@
 """A small checkpoint, and command lines that fail."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple

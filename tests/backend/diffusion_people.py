@@ -1,7 +1,5 @@
 """Small made-up people for tests of the diffusion room."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """People and a slab model for tests of the editing room."""
 
-from __future__ import annotations
-
 import torch
 from primdiffusion.diffusion.codec import WholeSlab
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel

@@ -1,7 +1,5 @@
 """A checkpoint with the names and shapes of the authors', and a body in SMPL's format, made of numbers of our own."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage 1 of the released code a second time, in float64 from SPEC 2 alone, with the names of `released_files`."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import os
 import subprocess
 import sys
 
@@ -54,3 +55,30 @@ def test_torch_is_loaded_with_the_first_name_that_is_used():
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="nothing"):
         pd.nothing  # noqa: B018
+
+
+def ran(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    """The command line in a process of its own."""
+    paths = os.pathsep.join(filter(None, (environment.pop("PYTHONPATH", ""), os.environ.get("PYTHONPATH", ""))))
+    everything = {**os.environ, **environment, "PYTHONPATH": paths}
+    command = [sys.executable, "-m", "primdiffusion", *words]
+    return subprocess.run(command, env=everything, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.unix
+@pytest.mark.parametrize("odd", [("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"), ("TMPDIR",), ("PYTHONPATH",)])
+def test_an_odd_environment_is_no_traceback(tmp_path, odd):
+    for name in ("cli", "commands", "formats", "serve", "utils"):  # modules of other programs, not to be imported
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('the wrong module')\n")
+    value = str(tmp_path) if odd == ("PYTHONPATH",) else "/dev/null/nowhere"
+    done = ran("info", **dict.fromkeys(odd, value))
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_package_that_cannot_be_imported_is_one_sentence(tmp_path):
+    (tmp_path / "numpy").mkdir()
+    (tmp_path / "numpy" / "__init__.py").write_text("raise ImportError('built for another Python')\n")
+    done = ran("info", PYTHONPATH=str(tmp_path))
+    assert done.returncode == 1
+    assert "numpy" in done.stderr or "another Python" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -3,8 +3,6 @@
 `python tests/backend/thread_bytes.py` prints, as JSON, of how many numbers of threads they do.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

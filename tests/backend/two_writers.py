@@ -3,8 +3,6 @@
 `python tests/backend/two_writers.py --rounds 25` prints a line of JSON with `two_writers_mixed`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

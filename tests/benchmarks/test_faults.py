@@ -2,16 +2,14 @@
 
 import json
 import sys
-from pathlib import Path
 
 import faults
 import pytest
 
 NAMES = {
     "threads_person_error_max", "same_bytes_threads",
-    "blend_properties_tried", "files_written_outside", "kills", "kills_lost", "child_deaths",
-    "child_deaths_lost", "child_hangs", "disk_full_commands", "disk_full_losses", "environments",
-    "environments_failed", "window_rounds", "window_crashes", "attack_cases", "attack_cases_held", "two_writers_mixed",
+    "blend_properties_tried", "files_written_outside", "window_rounds", "window_crashes", "attack_cases",
+    "attack_cases_held", "two_writers_mixed",
 }  # fmt: skip
 
 
@@ -63,45 +61,27 @@ def test_without_a_window_its_figures_are_absent_or_kept(measure, window):
 
 
 def test_a_part_is_measured_anew_alone_and_says_when(measure, tmp_path):
-    (tmp_path / "faults.json").write_text(json.dumps({"earlier_seconds": 3.0, "environments": 20, "commit": "old"}))
-    assert measure(1, "--parts", "kills")["environments"] == 20
+    (tmp_path / "faults.json").write_text(
+        json.dumps({"earlier_seconds": 3.0, "two_writers_mixed": 20, "commit": "old"})
+    )
+    assert measure(1, "--parts", "attacks")["two_writers_mixed"] == 20
     found = measure(2, "--parts", "threads", "blends")
-    assert (found["kills"], found["kills_recorded"]) == (1, "stamp 1")
+    assert (found["attack_cases"], found["attacks_recorded"]) == (1, "stamp 1")
     assert (found["blend_properties_tried"], found["blends_recorded"]) == (2, "stamp 2")
     assert "earlier_seconds" not in found  # nothing measures it any more
     assert found["commit"] != "old"
 
 
 def test_a_part_that_fails_leaves_those_before_it(measure):
-    found = measure(1, failing="kills")
+    found = measure(1, failing="attacks")
     assert found["blend_properties_tried"] == 1
-    assert "kills" not in found
+    assert "attack_cases" not in found
 
 
 def test_a_window_that_is_not_given_is_named(measure, capsys):
     with pytest.raises(SystemExit):
         measure(1, "--parts", "window")
     assert "--window" in capsys.readouterr().err
-
-
-def test_kills_of_all_processes_are_added(monkeypatch):
-    asked = []
-
-    def chaos(attack, *options):
-        asked.append((attack, *options))
-        return {"kills": 150, "kills_lost": int(options[1] == "1")}
-
-    monkeypatch.setattr(faults, "chaos", chaos)
-    monkeypatch.setattr(faults.os, "cpu_count", lambda: 2)
-    assert faults.kills(300) == {"kills": 300, "kills_lost": 1}
-    assert [words[words.index("--kills") + 1] for words in asked] == ["150", "150"]
-
-
-def test_the_programs_that_are_killed_exist():
-    from chaos.programs import Inputs, all_programs
-
-    known = {program.name for program in all_programs(Inputs(Path()))}
-    assert set(faults.KILLED) - {"payloads"} <= known  # payloads: where MakeHuman's assets are
 
 
 def test_every_attack_is_a_test_that_is_there():

@@ -1,20 +1,28 @@
 """People as grids of voxels, and the baseline that diffuses them."""
 
+import argparse
+
+import encoder_paper_form
+import fit_scenes
 import numpy as np
 import pytest
 import torch
+from capture_scenes import captured
+from encoder_paper_form import FORMS, figures_of, measured, train
+from primdiffusion.capture.reader import open_captures
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
+from primdiffusion.encoder.config import PAPER, PRESETS, encoder_config
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
 from support.errors import refused
+from tiny_encoder import TINY
 from voxel_baseline import (
     BLOCKS,
     BOUNDS,
     SIDE,
-    VALUES,
     VoxelCodec,
     VoxelModel,
     VoxelUNetConfig,
@@ -23,7 +31,6 @@ from voxel_baseline import (
     primitives_of,
     save_voxel_model,
     voxel_denoiser,
-    voxelise,
     voxelise_payload,
 )
 
@@ -69,15 +76,6 @@ def test_where_boxes_overlap_densities_add_and_colours_mix_by_density():
     near = grid[(places() - frames.position[0]).norm(dim=-1) < 0.1]
     assert torch.allclose(near[:, 3], torch.tensor(0.4), atol=0.02)
     assert torch.allclose(decode_srgb(near[:, :3]), torch.tensor([0.75, 0.0, 0.25]), atol=0.01)
-
-
-def test_colourings_of_one_geometry_are_gathered_together():
-    frames = boxes((0.2, 0.1, 0.0))
-    rgb = torch.rand(3, 1, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0))
-    density = plain(1, (0.0, 0.0, 0.0), 50.0).density
-    together = voxelise(frames, rgb, density, FULL)
-    alone = voxelise(frames, rgb[1:2], density, FULL)
-    assert torch.equal(together[1], alone[0])
 
 
 def test_delta_scale_makes_boxes_larger():
@@ -198,5 +196,37 @@ def test_another_file_is_no_baseline(tmp_path):
         load_voxel_model(tmp_path / "other.safetensors")
 
 
-def test_values_of_a_cell_are_its_voxels(codec):
-    assert codec.mean.shape == (len(codec.cells), VALUES)
+def test_forms_differ_from_the_papers_in_one_setting():
+    forms = {name: vars(encoder_config("paper", ablation)) for name, ablation in FORMS.items()}
+    paper = vars(PAPER)
+    found = {name: {key for key in paper if form[key] != paper[key]} for name, form in forms.items()}
+    expected = {
+        "full": set(),
+        "shared_scale": {"delta_scale"},
+        "template_rt": {"frames"},
+        "no_attention": {"attention"},
+    }
+    assert found == expected
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
+
+
+def test_a_form_is_trained_and_compared(captures, tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "paper", TINY)
+    few = {**fit_scenes.FEW, "threads": 1}
+
+    def settings(arguments, ablation, count):
+        return fit_scenes.settings(captures, tmp_path / "run", **{**few, "steps": count, "encoder": "paper"})
+
+    monkeypatch.setattr(encoder_paper_form, "settings", settings)
+    fit_scenes.forget_processes()
+    arguments = argparse.Namespace(minutes=0.001, given=1, cameras=1, compared_size=16)
+    path = tmp_path / "full.safetensors"
+    train(arguments, None, open_captures(captures), path)
+    figures = figures_of("full", path, measured(path, open_captures(captures), arguments))
+    assert figures["steps_full"] >= 1
+    assert 0 < figures["psnr_full"] < 60
+    assert figures["pictures_full"] >= 1

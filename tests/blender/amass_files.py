@@ -1,7 +1,5 @@
 """AMASS files, written for tests, and the feet of whoever moves by them."""
 
-from __future__ import annotations
-
 import numpy as np
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import about_axis, to_axis_angle

@@ -1,7 +1,5 @@
 """This interpreter as the child's Python, found without being tried."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@ python boxes_oracle.py FOLDER CASES own|default: writes person.human.safetensors
 a body of the user's, with pose-dependent correctives, in body.safetensors.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """BVH files of other rigs, written for tests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

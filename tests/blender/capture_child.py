@@ -1,7 +1,5 @@
 """A capture in a process of its own, to be killed: `python capture_child.py OUT`; prints a line for each view."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A person for tests of captures: the default body with few faces, painted, and posed by numpy rather than by bones."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Blender as a module: one process, a user folder of its own, an empty scene for each test."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -6,8 +6,6 @@ person's boxes) or {"draw": {...}, "out": npz}, where {"boxes": npz} may stand f
 Run by the backend's Python; Blender's tests compare the engine's pictures with it.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

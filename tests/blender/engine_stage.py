@@ -1,7 +1,5 @@
 """What the engine's tests share: the backend as an oracle, Blender's camera by hand, pictures from files."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A synthetic person in a scene, and what the child would make of them, for tests of exports."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

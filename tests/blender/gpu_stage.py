@@ -1,7 +1,5 @@
 """What the tests of the GPU's marcher share: humans of the backend, cameras by hand, pixels of textures."""
 
-from __future__ import annotations
-
 import gpu
 import numpy as np
 

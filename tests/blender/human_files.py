@@ -1,7 +1,5 @@
 """A human's data, and where its files are on the disk in this session."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

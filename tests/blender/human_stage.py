@@ -1,7 +1,5 @@
 """A human in the scene with files on the disk, and whether it is whole."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import synthetic

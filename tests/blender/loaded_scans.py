@@ -1,7 +1,5 @@
 """Scans on the default body, loaded, and how far their vertices are from it."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What Blender must show, computed with numpy alone."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 from synthetic import frames, skinning

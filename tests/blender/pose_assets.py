@@ -1,7 +1,5 @@
 """Poses of the extension's asset library, given to armatures as Blender's pose library does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

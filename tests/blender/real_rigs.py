@@ -6,8 +6,6 @@ The bones of the scans begin where those of such rigs do, centimetres from the b
 all bones along x at rest, all motions are in centimetres and begin close to a T pose.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from pathlib import Path

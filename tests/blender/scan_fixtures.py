@@ -1,7 +1,5 @@
 """Files of people as others make them: the default body with other rigs' bones, rests, units and axes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

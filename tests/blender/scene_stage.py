@@ -1,7 +1,5 @@
 """Edits of humans in the scene, written and shown at once, and pictures of the scene."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

@@ -1,7 +1,5 @@
 """What is in the open .blend, for tests of what leaves it as it was."""
 
-from __future__ import annotations
-
 import bpy
 
 _BLENDER_LISTS = {"window_managers", "workspaces", "screens", "texts", "palettes", "brushes", "libraries", "all_ids"}

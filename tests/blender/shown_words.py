@@ -1,7 +1,5 @@
 """Every label and tooltip of the extension, gathered from what is registered."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import bpy

@@ -1,7 +1,5 @@
 """A person for tests: blobs along the bones of SMPL's skeleton, in files as the backend writes them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

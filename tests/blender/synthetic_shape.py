@@ -1,7 +1,5 @@
 """A synthetic person whose body follows its shape."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The zip a user installs: complete, reproducible, accepted by Blender; it generates with the real child."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """docs/manual/api.md tells of what is registered, and of nothing else."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

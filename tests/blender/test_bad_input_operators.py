@@ -1,7 +1,5 @@
 """Everything a user can press in a wrong order: each operator works, or says in one sentence what is wrong."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import re

@@ -1,7 +1,5 @@
 """The example of a script does what it says, and fails as a script should."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

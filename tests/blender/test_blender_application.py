@@ -4,8 +4,6 @@ The environment variable BLENDER names the program, else it is looked for on PAT
 temporary folder (a snap, a chroot), give pytest a --basetemp that it can.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Where the extension keeps things."""
 
-from __future__ import annotations
-
 import pytest
 
 from blender_primdiffusion import places

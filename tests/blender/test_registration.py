@@ -1,7 +1,5 @@
 """Enabling and disabling the extension: what it imports, what it leaves, and people in files without it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Fifty humans in and out of one file, with undo and redo: nothing of them stays in Blender."""
 
-from __future__ import annotations
-
 import bpy
 import psutil
 import pytest

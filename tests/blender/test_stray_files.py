@@ -1,7 +1,5 @@
 """What a run of the tests leaves on the disk."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Words in the interface: every label a title, every tooltip a sentence, every error with its reason."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import re

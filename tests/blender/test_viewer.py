@@ -1,7 +1,5 @@
 """The viewer's zip: no code that downloads, accepted by Blender; in it humans are opened, posed, reshaped, exported."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

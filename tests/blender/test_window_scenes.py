@@ -1,7 +1,5 @@
 """scripts/window plays in a real window, which no test opens: what it names must at least be there."""
 
-from __future__ import annotations
-
 import re
 import sys
 from importlib import import_module

@@ -1,7 +1,5 @@
 """A Blender without numpy or OpenImageIO, as Debian may package it: enabling the extension says what to install."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

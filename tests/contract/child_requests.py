@@ -1,7 +1,5 @@
 """Requests of the extension's works, for tests with the real child."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 A reader of a new kind gets a line in KINDS; a new way to lie about a kind's size, shape or numbers one in CLAIMS.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

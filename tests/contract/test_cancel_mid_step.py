@@ -1,8 +1,6 @@
 """A cancel in the middle of a step, with the real child: the step is made to hold the interpreter for a minute, so that
 the child neither hears the cancel nor beats."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

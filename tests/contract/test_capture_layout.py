@@ -1,7 +1,5 @@
 """The file format both programs write, and the cameras of a camera_rig."""
 
-from __future__ import annotations
-
 import json
 import struct
 import subprocess

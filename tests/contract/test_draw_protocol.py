@@ -157,16 +157,3 @@ def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, reques
         assert message in answer["error"]["message"]
         assert "\n" not in answer["error"]["message"]
     assert "result" in ask(child, params)[0]
-
-
-def test_a_second_picture_is_rejected_while_one_is_drawn(child, request_for):
-    params, id = request_for(width=900, height=1200, step=0.0005), next(ids)
-    child.send(id, "draw", **params)
-    child.until(lambda m: m.get("method") == "progress" and m["params"]["step"] > 0)
-    assert ask_error(child, request_for()) == "busy"
-    child.ask(next(ids), "cancel", id=id)
-    child.answer(id)
-
-
-def ask_error(child: Conversation, params: dict) -> str:
-    return child.ask(next(ids), "draw", **params)["error"]["data"]["kind"]

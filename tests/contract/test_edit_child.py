@@ -11,7 +11,7 @@ from primdiffusion.editing.regions import region_from_weights, region_of
 from primdiffusion.human_file import load_human, save_human
 from tiny_model import VOCABULARY
 
-CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
+DOMAIN_ERROR, INVALID_PARAMS = -32002, -32602
 RESULTS = ("person", "preview", "side", "depth")
 
 
@@ -72,12 +72,6 @@ def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, 
     assert not list(Path(asked["out_dir"]).glob(".*"))
 
 
-def test_outside_the_region_the_files_hold_the_same_bits(child, people, asked):
-    for method in ("inpaint", "transfer"):
-        result = child.ask(2, method, **asked, **parameters(method, people))["result"]
-        assert outside(result["person"], people["ann"], region_of(EDITS[method]["region"]))
-
-
 def test_a_region_may_be_painted(child, people, asked, tmp_path):
     weights = np.zeros(12196, np.float32)
     weights[:6000] = 1
@@ -112,26 +106,6 @@ def test_attributes_tells_what_generate_can_be_asked_for(child, checkpoint, aske
     assert not torch.equal(first.payload.rgb, second.payload.rgb)
 
 
-def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, slow_checkpoint, asked):
-    changes = {"steps": BUSY_STEPS, "checkpoint": str(slow_checkpoint)}
-    child.send(8, "inpaint", **{**asked, **parameters("inpaint", people), **changes})
-    child.until(
-        lambda m: m.get("method") == "progress" and m["params"]["stage"] == "sample" and m["params"]["step"] > 1
-    )
-    child.send(9, "cancel", id=8)
-    assert child.answer(9)["result"] == {"cancelled": True}
-    steps = []
-
-    def ended(message):
-        if message.get("method") == "progress":
-            steps.append(message["params"]["step"])
-        return message.get("id") == 8
-
-    assert child.until(ended)["error"]["code"] == CANCELLED
-    assert len(steps) <= 1
-    assert not Path(asked["out_dir"]).parent.exists()
-
-
 @pytest.mark.parametrize(
     ("method", "wrong", "code", "kind", "sentence"),
     [
@@ -156,6 +130,30 @@ def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, 
     assert not Path(asked["out_dir"]).parent.exists()
 
 
-def test_a_missing_parameter_is_named(child, people):
-    error = child.ask(11, "interpolate", person=people["ann"], out_dir="x")["error"]
-    assert (error["code"], "interpolate.other" in error["message"]) == (INVALID_PARAMS, True)
+def test_variations_name_each_picture_as_it_appears_and_whom_it_shows(child, checkpoint, tmp_path):
+    out = tmp_path / "sheet ü"
+    child.send(1, "variations", seeds=[3, 4], out_dir=str(out), steps=2, checkpoint=str(checkpoint), size=32)
+    shown = []
+
+    def collect(message):
+        news = message.get("params", {})
+        if news.get("stage") == "write":
+            shown.append((news["index"], news["step"], news["total"], Path(news["picture"]).name))
+        return message.get("id") == 1 and "method" not in message
+
+    result = child.until(collect)["result"]
+    assert shown == [(0, 1, 2, "3.png"), (1, 2, 2, "4.png")]
+    for person in result["people"]:
+        assert all(Path(person[name]).is_file() for name in ("person", "picture"))
+    assert len(list(out.iterdir())) == 4
+
+
+def test_a_long_generation_shows_pictures_and_cancelling_removes_them(child, slow_checkpoint, tmp_path):
+    out = tmp_path / "person"
+    params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(slow_checkpoint)}
+    child.send(4, "generate", **params, picture_px=48)
+    news = child.until(lambda message: message.get("params", {}).get("picture"))["params"]
+    assert Path(news["picture"]).read_bytes().startswith(b"\x89PNG")
+    child.send(5, "cancel", id=4)
+    assert child.answer(4)["error"]["code"] == -32001
+    assert not out.exists()

@@ -1,7 +1,5 @@
 """Files of poses mean the same to the backend and to the extension."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

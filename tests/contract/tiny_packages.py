@@ -1,7 +1,5 @@
 """A package index of tiny wheels: the real venv, pip and hash checks in a few seconds."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import hashlib

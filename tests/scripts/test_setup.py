@@ -1,7 +1,5 @@
 """The command that sets up the environments: what is missing is said before anything is installed."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

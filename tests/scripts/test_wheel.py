@@ -1,7 +1,5 @@
 """The wheel and the source archive for PyPI: complete, with valid metadata."""
 
-from __future__ import annotations
-
 import re
 import tarfile
 import tomllib

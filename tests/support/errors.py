@@ -1,7 +1,5 @@
 """Errors by their kind and by what they name, not by their words."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Triton's kernels compiled for sm_90 (H100, H200) as they are launched, without such a device."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path

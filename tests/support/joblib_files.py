@@ -1,7 +1,5 @@
 """Files as joblib.dump writes them: pickles with the bytes of arrays between their operations."""
 
-from __future__ import annotations
-
 import io
 import pickle
 import sys

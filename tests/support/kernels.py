@@ -3,8 +3,6 @@
 numba has a cache for each folder of sources, and compiling the marcher takes half a minute.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """SMPL's motion as SAM 3D Body would return it of MHR, whose joints have rest orientations of their own."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs of commands: their processes, and what training leaves in a folder."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Files of synthetic humans: safetensors, written and read by numpy alone, without the product's code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

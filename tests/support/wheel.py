@@ -1,7 +1,5 @@
 """The archives for PyPI, built from a copy of the sources."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -12,8 +12,6 @@ support.windows_rules`, before anything of ours is imported.
 Nor can paths with backslashes, limits on their length, and folders that ignore case.
 """
 
-from __future__ import annotations
-
 import builtins
 import errno
 import importlib.abc

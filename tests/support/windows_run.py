@@ -1,7 +1,5 @@
 """Run tests of files, captures and the child under Windows' rules (`windows_rules`), in a process of their own."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

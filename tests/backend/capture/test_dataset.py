@@ -153,12 +153,3 @@ def test_crops_lie_in_the_picture_and_see_the_person(captures):
 def test_samples_without_views_are_rejected(wrong):
     with refused(ValueError, next(iter(wrong))):
         SampleSettings(**wrong)
-
-
-def test_a_missing_picture_is_named_by_a_worker(tmp_path):
-    root = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
-    for path in root.rglob("img/*/0000.jpg"):
-        path.unlink()
-        path.with_name("0001.jpg").write_bytes(b"")
-    with refused((ValueError, FileNotFoundError), "000", ".jpg"):
-        first(1, CaptureDataset(open_captures(root), SETTINGS), 1, workers=1)

@@ -1,7 +1,5 @@
 """People spread over the workers of a real Ray cluster on this machine."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

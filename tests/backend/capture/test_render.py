@@ -117,17 +117,6 @@ def test_no_worker_writes_through_a_link_in_the_folder_of_a_human(tmp_path, fold
     assert not list(outside.iterdir())
 
 
-def test_what_a_killed_process_left_half_written_goes(tmp_path):
-    job = small_job(tmp_path)
-    left = job.out / NAMES[0] / "img/camera0000/.0000.4242.partial.jpg"
-    capture_layout.claim(job.out, job.about)
-    left.parent.mkdir(parents=True)
-    left.write_bytes(b"half")
-    list(render(job))
-    assert not left.exists()
-    assert verify(job.out) == {}
-
-
 def test_workers_end_when_the_command_is_killed(tmp_path):
     save_person(tmp_path / "people" / "p0" / "person.glb")
     save_person(tmp_path / "people" / "p1" / "person.glb")

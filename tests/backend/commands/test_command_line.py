@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import pytest
+from primdiffusion.commands import progress as module
 from primdiffusion.commands.command_line import parse
 from primdiffusion.commands.options import OPTIONS
+from primdiffusion.commands.progress import Pace
 from primdiffusion.formats.requests import Attributes, GenerateRequest
 from primdiffusion.formats.schema import FieldError, Option, Range
 
@@ -75,3 +77,32 @@ def test_every_command_has_help(name, capsys):
         parse(OPTIONS[name], ["--help"], name)
     assert end.value.code == 0
     assert not re.search(r"\d{12}|\de[+]\d|Posix|Windows(Path|Posix)", capsys.readouterr().out), "limits nobody reaches"
+
+
+def paced(monkeypatch, steps: list[float]) -> list[float | None]:
+    """Estimates after steps of these seconds."""
+    now, pace, found = 0.0, Pace(), []
+    for done, step in enumerate(steps, 1):
+        now += step
+        monkeypatch.setattr(module.time, "perf_counter", lambda now=now: now)
+        found.append(pace.left(done, len(steps)))
+    return found
+
+
+def test_the_time_left_leaves_out_loading_and_compiling(monkeypatch):
+    steps = [90.0, 4.0, 60.0, 4.0, 5.0, *([4.0] * 25)]  # the marcher is compiled for a preview in the third
+    found = paced(monkeypatch, steps)
+    assert found[:2] == [None, None]
+    for done in range(3, len(steps)):
+        assert found[done - 1] == pytest.approx(sum(steps[done:]), rel=0.15)
+    assert found[-1] == 0
+
+
+def test_the_time_left_follows_a_machine_that_becomes_slow(monkeypatch):
+    found = paced(monkeypatch, [1.0] * 20 + [10.0] * 20)
+    assert found[18] == pytest.approx(21)
+    assert found[30] == pytest.approx(90)
+
+
+def test_a_single_step_leaves_nothing_to_wait_for(monkeypatch):
+    assert paced(monkeypatch, [30.0]) == [0]

@@ -10,13 +10,18 @@ from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.model_card import model_card
+from primdiffusion.diffusion.pretrained import save_pretrained
+from primdiffusion.diffusion.reading import unfollowed, warnings_of
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.editing.vary import vary
 from primdiffusion.files.regular_files import FileError
+from primdiffusion.human import generate
 from primdiffusion.primitives.primitives import GRID, K
 from safetensors import safe_open
 from safetensors.torch import save_file
 from support.errors import refused
+from tiny_model import model_of_two_kinds, save_tiny_checkpoint, tiny_model
 
 LEVELS = ("50", "100", "300", "500", "700", "900")
 
@@ -260,3 +265,112 @@ def test_the_default_checkpoint_draws_people_that_differ(default):
 def test_the_committed_model_card_is_the_checkpoint_s(request):
     page = request.config.rootpath / "docs" / "model_card.md"
     assert page.read_text() == model_card(read_card())
+
+
+MODEL = model_of_two_kinds()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_combination_that_no_training_human_has_is_named(seed):
+    asked = {"sex": "female", "outfit": "suit"}
+    made = generate(MODEL, seed, 3, attributes=asked).provenance
+    assert made["unfollowed"] in ({"sex": "male"}, {"outfit": "jeans"})
+    (warning,) = warnings_of(made)
+    ((name, shown),) = made["unfollowed"].items()
+    assert f"{name} {asked[name]!r} ({shown!r} instead)" in warning
+    assert len(warning) < 300
+
+
+@pytest.mark.parametrize("asked", [{}, {"sex": "male"}, {"sex": "female", "outfit": "jeans"}])
+def test_what_was_followed_is_not_named(asked):
+    made = generate(MODEL, 1, 3, attributes=asked).provenance
+    assert "unfollowed" not in made
+    assert warnings_of(made) == []
+
+
+def test_a_variant_that_stays_as_it_was_is_named():
+    woman = generate(MODEL, 1, 3, attributes={"sex": "female"})
+    made = vary(MODEL, woman, 0.05, 2, 3, attributes={"sex": "male"}).provenance["edits"][-1]
+    assert made["unfollowed"] == {"sex": "female"}
+    assert "sex 'male' ('female' instead)" in warnings_of(made)[0]
+
+
+def test_a_model_without_kinds_reads_nothing():
+    x0 = torch.zeros(2, *MODEL.codec.shape)
+    for denoiser in (torch.nn.Identity(), without_kinds()):
+        model = dataclasses.replace(MODEL, denoiser=denoiser)
+        assert unfollowed(model, x0, {"sex": "female"}) == [{}, {}]
+
+
+def without_kinds() -> PersonDenoiser:
+    prior = dataclasses.replace(MODEL.denoiser.prior, kind=torch.zeros(1, 2, 0))
+    return PersonDenoiser(DenoiserConfig(person=None, local=None), prior, MODEL.schedule)
+
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def drawn(model):
+    *_, last = sample(model, [3], steps=2)
+    return last.x0
+
+
+def hub(folder, *commits, main=None):
+    """A repository of a hub cache: snapshots are links to blobs."""
+    blob = save_tiny_checkpoint(folder / "blobs" / "weights")
+    for commit in commits:
+        (folder / "snapshots" / commit).mkdir(parents=True)
+        (folder / "snapshots" / commit / "model.safetensors").symlink_to(blob)
+    if main is not None:
+        (folder / "refs").mkdir()
+        (folder / "refs" / "main").write_text(main)
+    return folder
+
+
+def test_a_saved_folder_loads_as_the_same_model(tmp_path):
+    loaded = load_checkpoint(save_tiny_checkpoint(tmp_path / "tiny.safetensors"))
+    folder = save_pretrained(loaded, tmp_path / "folder")
+    assert sorted(path.name for path in folder.iterdir()) == ["README.md", "config.json", "model.safetensors"]
+    again = load_checkpoint(folder)
+    assert torch.equal(drawn(again), drawn(loaded))
+    assert again.vocabulary == loaded.vocabulary
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["library_name"], config["kind"], config["schedule"]) == ("primdiffusion", "person", "linear")
+    card = (folder / "README.md").read_text()
+    assert card.startswith("---\nlibrary_name: primdiffusion\nlicense: other\n")
+    assert "# Model card: tiny" in card
+
+
+def test_the_readme_is_the_card_of_the_default_checkpoint(tmp_path):
+    folder = save_pretrained(load_checkpoint(), tmp_path / "default")
+    card = (folder / "README.md").read_text()
+    assert "license: cc0-1.0" in card
+    assert card.split("---\n", 2)[2].split("sha256")[0] == model_card(read_card()).split("sha256")[0]
+
+
+@pytest.mark.parametrize(("commits", "main"), [((COMMIT, "other"), COMMIT + "\n"), ((COMMIT,), None)])
+def test_a_repository_of_a_hub_cache_loads_its_main_or_only_snapshot(tmp_path, commits, main):
+    model = load_checkpoint(hub(tmp_path / "models--us--tiny", *commits, main=main))
+    assert model.card["name"] == "tiny"
+    assert load_checkpoint(tmp_path / "models--us--tiny" / "snapshots" / COMMIT).card == model.card
+
+
+@pytest.mark.parametrize(("commits", "main"), [(("a", "b"), None), ((), None), (("a",), "../snapshots/a")])
+def test_a_folder_without_one_model_is_refused(tmp_path, commits, main):
+    with refused(FileError):
+        load_checkpoint(hub(tmp_path / "models--us--tiny", *commits, main=main))
+
+
+def test_a_name_on_the_hub_is_not_downloaded():
+    with refused(FileNotFoundError, "download"):
+        load_checkpoint("owner/name")
+
+
+def test_models_that_a_folder_cannot_hold_are_refused_and_leave_nothing(tmp_path):
+    levels = dataclasses.replace(linear(), alpha_bar=linear().alpha_bar * 0.9)
+    unnamed = dataclasses.replace(tiny_model(), schedule=levels)
+    imported = dataclasses.replace(tiny_model(), body_setup=object())
+    for model, word in ((unnamed, "no name"), (imported, "your body file")):
+        with pytest.raises(ValueError, match=word):
+            save_pretrained(model, tmp_path / "folder")
+    assert not (tmp_path / "folder").exists()

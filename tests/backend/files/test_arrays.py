@@ -1,10 +1,7 @@
 """The reader of arrays on damaged and hostile files."""
 
-from __future__ import annotations
-
 import os
 import struct
-import tracemalloc
 import warnings
 import zipfile
 
@@ -36,16 +33,6 @@ def npz(path, member: bytes, method: int = zipfile.ZIP_DEFLATED):
     return path
 
 
-def patched(path, offset: int, value: int):
-    """Change a field of the member's two headers: `offset` of the local one."""
-    data = bytearray(path.read_bytes())
-    for mark, further in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
-        place = data.find(mark) + offset + further
-        data[place : place + 2] = struct.pack("<H", value)
-    path.write_bytes(data)
-    return path
-
-
 def assert_one_sentence(error: Exception, path) -> None:
     assert str(path) in str(error)
     assert len(str(error)) - len(str(path)) < 250
@@ -67,6 +54,13 @@ def assert_one_sentence(error: Exception, path) -> None:
         npy("'<f99'"),
         npy("'|O'"),
         npy(shape="(3,)", data=bytes(11)),
+        npy(shape="(True,)", data=bytes(4)),
+        npy(shape="(1.0,)", data=bytes(4)),
+        npy(shape="[1]", data=bytes(4)),
+        npy("'<c16'", data=bytes(48)),
+        npy("'<M8[s]'", data=bytes(24)),
+        npy("[('a', '<f4')]", data=bytes(12)),
+        npy("'<U1000000000'", "()", bytes(4)),
     ],
 )
 def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
@@ -74,23 +68,6 @@ def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
     with pytest.raises(FileError) as raised:
         read_arrays(path, ("pose",))
     assert_one_sentence(raised.value, path)
-
-
-@pytest.mark.parametrize(("offset", "value"), [(8, 99), (8, 12), (6, 1)], ids=["unknown", "bzip2", "encrypted"])
-def test_members_packed_in_another_way_are_rejected(tmp_path, offset, value):
-    path = patched(npz(tmp_path / "poses.npz", npy(data=bytes(12))), offset, value)
-    with pytest.raises(FileError) as raised:
-        read_arrays(path, ("pose",))
-    assert_one_sentence(raised.value, path)
-
-
-def test_a_bomb_is_not_unpacked(tmp_path):
-    path = npz(tmp_path / "bomb.npz", npy(data=bytes(12)) + bytes(2**26), zipfile.ZIP_BZIP2)
-    tracemalloc.start()
-    with pytest.raises(FileError):
-        read_arrays(path, ("pose",))
-    assert tracemalloc.get_traced_memory()[1] < 2**23
-    tracemalloc.stop()
 
 
 def test_megabytes_of_zeros_are_not_unpacked(tmp_path):
@@ -153,14 +130,6 @@ def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
         array_shape(path, "pose")
 
 
-def test_a_full_disk_is_one_error():
-    if not os.path.exists("/dev/full"):
-        pytest.skip("no device that is always full")
-    with refused(OSError, "space") as raised:
-        write_deflated("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
-    assert raised.value.__context__ is None or isinstance(raised.value.__context__, (OSError, ValueError))
-
-
 def test_a_mapped_array_may_be_larger_than_what_is_read_at_once(tmp_path, monkeypatch):
     np.save(tmp_path / "a.npy", np.arange(12, dtype=np.uint8).reshape(3, 4))
     monkeypatch.setattr("primdiffusion.files.arrays.LARGEST_BYTES", 10)
@@ -173,28 +142,6 @@ def test_numbers_of_half_precision_are_checked_without_a_warning():
         assert all_finite(np.float16([-65504, 1]))
         assert not all_finite(np.float16([1, np.inf]))
         assert not all_finite(np.float32([1e31]))
-
-
-@pytest.mark.parametrize("shape", ["(True,)", "(1.0,)", "[1]", "(1e3,)"])
-def test_sides_of_a_shape_are_integers(tmp_path, shape):
-    head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
-    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
-    with refused(FileError, "a.npy"):
-        read_npy(tmp_path / "a.npy")
-
-
-@pytest.mark.parametrize("values", [np.ones(2, complex), np.zeros(2, "M8[s]"), np.zeros(2, [("a", "f4")])])
-def test_neither_complex_numbers_nor_dates_nor_records_are_read(tmp_path, values):
-    np.save(tmp_path / "a.npy", values)
-    with refused(FileError):
-        read_npy(tmp_path / "a.npy")
-
-
-def test_a_text_whose_size_wraps_is_rejected(tmp_path):
-    head = b"{'descr': '<U1000000000', 'fortran_order': False, 'shape': (), }".ljust(117) + b"\n"
-    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
-    with refused(FileError, "a.npy"):
-        read_npy(tmp_path / "a.npy")
 
 
 def test_headers_of_python_2_are_read_without_a_warning(tmp_path, recwarn):
@@ -228,3 +175,23 @@ def test_what_grows_beyond_the_limit_before_it_is_opened_is_not_read(tmp_path, m
     monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
     with pytest.raises(regular_files.FileError):
         regular_files.read_regular(path, 20)
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 99), (8, 12), (6, 1)], ids=["unknown", "bzip2", "encrypted"])
+def test_members_packed_in_another_way_are_rejected(tmp_path, offset, value):
+    path = npz(tmp_path / "poses.npz", npy(data=bytes(12)))
+    data = bytearray(path.read_bytes())
+    for mark, further in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):  # the member's two headers
+        place = data.find(mark) + offset + further
+        data[place : place + 2] = struct.pack("<H", value)
+    path.write_bytes(data)
+    with pytest.raises(FileError) as raised:
+        read_arrays(path, ("pose",))
+    assert_one_sentence(raised.value, path)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+def test_a_full_disk_is_one_error():
+    with refused(OSError, "space") as raised:
+        write_deflated("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
+    assert raised.value.__context__ is None or isinstance(raised.value.__context__, (OSError, ValueError))

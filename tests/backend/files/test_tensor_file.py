@@ -1,13 +1,20 @@
 """Safetensors files whose bytes depend on their content alone."""
 
 import os
+import pickle
+import struct
 import subprocess
 import sys
+import time
+import tracemalloc
+import zipfile
 
 import pytest
 import safetensors.torch
 import torch
+from primdiffusion.files import smpl_pickle, torch_file
 from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.smpl_pickle import as_array, load_restricted
 from primdiffusion.files.tensor_file import LARGEST_FILE, ParameterLimit, load_network, read, save
 from safetensors import safe_open
 from support.errors import refused
@@ -104,3 +111,116 @@ def test_a_network_gets_the_weights_of_a_file():
 def test_what_is_larger_than_the_file_gets_no_memory(build):
     with refused(RuntimeError, "parameters"), ParameterLimit({"a": torch.zeros(10)}):
         build()
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_tensors_are_read(tmp_path, legacy):
+    content = {"a": torch.arange(6.0).reshape(2, 3).half(), "b": torch.nn.Parameter(torch.ones(3)), "n": {"step": 3}}
+    torch.save(content, tmp_path / "a.pt", _use_new_zipfile_serialization=not legacy)
+    found = torch_file.load(tmp_path / "a.pt")
+    assert isinstance(found, dict)
+    assert torch.equal(found["a"], content["a"])
+    assert torch.equal(found["b"], content["b"])
+    assert found["n"] == {"step": 3}
+
+
+def test_the_sentence_names_what_a_pickle_would_have_run(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
+        archive.writestr("a/data.pkl", b"cos\nsystem\n(S'touch CANARY'\ntR.")
+        archive.writestr("a/version", b"3")
+    with refused(FileError, "os.system", "nothing was executed"):
+        torch_file.load(tmp_path / "a.pt")
+
+
+def test_an_archive_that_unpacks_to_more_than_it_has_is_refused(tmp_path):
+    torch.save({"a": torch.zeros(1000)}, tmp_path / "a.pt")
+    with zipfile.ZipFile(tmp_path / "a.pt") as stored, zipfile.ZipFile(tmp_path / "b.pt", "w", 8) as packed:
+        for name in stored.namelist():
+            packed.writestr(name, stored.read(name))
+    with refused(FileError, "compressed"):
+        torch_file.load(tmp_path / "b.pt")
+
+
+def test_writing_to_what_was_loaded_leaves_the_file_as_it_is(tmp_path):
+    torch.save({"a": torch.arange(6.0)}, tmp_path / "a.pt")
+    content = (tmp_path / "a.pt").read_bytes()
+    found = torch_file.load(tmp_path / "a.pt")
+    assert isinstance(found, dict)
+    found["a"][:] = -1
+    assert (tmp_path / "a.pt").read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x8b" + struct.pack("<i", 2**31 - 1) + b"1.",
+        b"\x8b" + struct.pack("<i", -5) + b"1.",
+        b"\x8e" + struct.pack("<Q", 2**62) + b"1.",
+        b"\x80\x05\x96" + struct.pack("<Q", 2**33) + b"1.",
+        b"L" + b"9" * 200_000 + b"L\n.",
+        b"(" + b"]" * 2_000_000 + b"l.",
+        b"N" + b"\x85" * 2_000_000 + b".",
+        b"}N" + b"\x85" * 200_000 + b"Ns.",
+        b"Phello\n.",
+        b"\x82\x01.",
+        b"\x80\x09N.",
+        b"b.", b"0.", b"t.", b"R.", b"h\x05.", b"N", b"", b"NNR.",
+    ],
+)  # fmt: skip
+def test_hostile_pickles_end_at_once_within_little_memory(data):
+    tracemalloc.start()
+    began = time.process_time()
+    with pytest.raises(FileError) as raised:
+        load_restricted(data, "a.pkl")
+    assert tracemalloc.get_traced_memory()[1] < 2**26
+    tracemalloc.stop()
+    assert time.process_time() - began < 10
+    assert len(str(raised.value)) < 150
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_plain_values_come_back(protocol):
+    value = {"a": [1, -2.5, None, True, 2**40], "b": ("x", ()), "c": {}, "ä": "line\nbreak '"}
+    assert load_restricted(pickle.dumps(value, protocol), "a.pkl") == value
+
+
+@pytest.mark.parametrize("data", [b"Np300000000\n.", b"Nr\xff\xff\xff\x7f."])
+def test_a_value_remembered_under_a_large_number_takes_no_memory(data):
+    tracemalloc.start()
+    assert load_restricted(data, "a.pkl") is None
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
+
+
+def test_strings_of_python_2_are_latin1_and_as_long_as_their_line():
+    data = b"(lp1\nS'\\x80\\xff" + b"x" * 2_000_000 + b"'\np2\naU\x01\xe9a."
+    first, second = load_restricted(data, "a.pkl")
+    assert (first[:3], len(first), second) == ("\x80\xffx", 2_000_002, "\xe9")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"cnumpy\nndarray\nN}S'arguments'\nNs\x86b.",
+        b"ccopyreg\n_reconstructor\nN}S'__new__'\nNs\x86b.",
+        b"ccopyreg\n_reconstructor\n}S'__new__'\nNsb.",
+        b"\x80\x02cnumpy\nndarray\n)\x81N}S'__class__'\nNs\x86b.",
+    ],
+)
+def test_a_state_changes_neither_classes_nor_what_an_object_is(data):
+    before = {kind: dict(vars(kind)) for kind in vars(smpl_pickle).values() if isinstance(kind, type)}
+    try:
+        found = load_restricted(data, "a.pkl")
+    except FileError:
+        pass
+    else:
+        assert type(found) is smpl_pickle.Inert
+    assert before == {kind: dict(vars(kind)) for kind in before}
+
+
+def test_lists_that_contain_each_other_often_are_counted_not_unrolled():
+    value: list = [1.0]
+    for _ in range(30):
+        value = [value] * 10
+    with pytest.raises(ValueError, match="more than"):
+        as_array(value)

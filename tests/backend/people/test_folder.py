@@ -1,19 +1,16 @@
 """People folders: whole or not at all, the same everywhere, licences of all assets. Need a MakeHuman asset folder."""
 
-import errno
 import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import psutil
 import pytest
-from primdiffusion.files.whole_files import writer
 from primdiffusion.people import folder as folder_module
 from primdiffusion.people import load_base_mesh, make_person
 from primdiffusion.people.assets import licence_of
@@ -81,27 +78,6 @@ def test_other_sets_of_people_are_rejected(assets, two):
 def test_sets_without_people_are_rejected(tmp_path, seed, count, name):
     with refused(ValueError, name):
         PeopleSet(tmp_path, seed, count)
-
-
-def test_full_disk_is_named_and_leaves_nothing(assets, tmp_path, monkeypatch):
-    def full(self, data):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with refused(OSError, "person_000005") as caught:
-        folder_module.write_person(assets, tmp_path / "person_000005", 5)
-    assert caught.value.errno == errno.ENOSPC
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_killed_processes_left_is_removed(assets, two):
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    left = two / f".person_000009.{writer().replace(str(os.getpid()), str(child.pid))}.partial"
-    left.mkdir()
-    (left / "person.glb").write_bytes(b"half")
-    list(make_people(assets, PeopleSet(two, 3, 2), 1))
-    assert not left.exists()
 
 
 def test_licences_are_read_from_headers_lists_and_materials(tmp_path):

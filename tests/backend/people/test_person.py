@@ -43,13 +43,10 @@ def same_pictures(first, second):
     return all(np.array_equal(a.texture, b.texture) for a, b in zip(first.mesh.parts, second.mesh.parts, strict=True))
 
 
-def test_no_folder_says_how_to_name_one(monkeypatch):
+def test_no_folder_says_how_to_name_one_and_an_absent_one_is_named(monkeypatch, tmp_path):
     monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
     with refused(FileNotFoundError, "--assets", ENVIRONMENT_VARIABLE):
         open_assets()
-
-
-def test_absent_folder_is_named(tmp_path):
     with refused(FileNotFoundError, "nowhere"):
         open_assets(tmp_path / "nowhere")
 

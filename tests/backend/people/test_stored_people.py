@@ -1,7 +1,5 @@
 """Stored humans whose content cannot be."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A body's files are read once: what was hashed is what is loaded, even if the files change in between."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Primitives in one grid: as a slow twin sums them, by hand where one box is alone, within limits."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

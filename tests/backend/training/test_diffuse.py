@@ -229,15 +229,6 @@ def test_a_damaged_file_of_the_run_is_named(people, whole, tmp_path, name):
     assert path.read_bytes() == damaged
 
 
-def test_a_loss_that_is_not_finite_stops_the_run_with_a_sentence(people, run, monkeypatch):
-    monkeypatch.setattr(CellTask, "loss", lambda self, step: {"loss": self.denoiser.person.outer.weight.sum() / 0})
-    with refused(ValueError, "person", "step 0", "--person.learning-rate") as error:
-        train(settings(people, run))
-    sentence(error.value)
-    assert not (run / "person.state.safetensors").exists()
-    assert not (run / MODEL).exists()
-
-
 def test_memory_that_runs_out_names_a_batch_to_try(people, run, monkeypatch):
     def greedy(self, step):
         raise RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 99 bytes")

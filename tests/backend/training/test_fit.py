@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from capture_scenes import captured
-from fit_scenes import STATE, WHOLE, files, flags, make_small, settings, stop_after
+from fit_scenes import STATE, WHOLE, files, flags, settings, stop_after
 from PIL import Image
 from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.reader import open_captures
@@ -26,17 +25,9 @@ from safetensors.torch import load_file
 from support.errors import refused
 from support.runs import rows, sentence
 
+pytestmark = pytest.mark.usefixtures("small_fit")
+
 ROOT = Path(__file__).parents[3]
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    make_small(monkeypatch)
 
 
 @pytest.fixture
@@ -181,13 +172,6 @@ def test_a_picture_that_goes_missing_is_named(own, tmp_path, workers):
         fit(settings(own, tmp_path / "run", workers=workers))
     assert sentence(error.value).endswith("is missing: render the subject again")
     assert sentence(error.value).startswith(str(own / "person_000001" / "img"))
-
-
-def test_a_mask_of_another_size_is_named(own, tmp_path):
-    for path in own.glob("person_000000/mask/*/*.png"):
-        Image.new("L", (30, 30)).save(path)
-    with refused(ValueError, "30 x 30 pixels"):
-        fit(settings(own, tmp_path / "run"))
 
 
 def test_a_human_on_another_body_is_named_before_training_begins(own, tmp_path):

@@ -129,26 +129,6 @@ def test_gradients_reach_the_picture_and_no_weights(vgg_file):
     assert not any(parameter.requires_grad for parameter in loss.parameters())
 
 
-def test_equal_pictures_cost_nothing_and_noise_costs_more(vgg_file):
-    loss = load_perceptual(vgg_file)
-    target, noise = torch.rand(16, 16, 3), torch.randn(16, 16, 3)
-    near, far = (loss(target + amount * noise, target) for amount in (0.01, 0.1))
-    assert float(loss(target, target)) == 0 < float(near) < float(far)
-
-
-def test_a_descent_on_the_loss_finds_the_target(vgg_file):
-    loss = load_perceptual(vgg_file, VGG_LAYERS[:2], (1.0, 1.0))
-    target = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(2))
-    image = torch.full_like(target, 0.5).requires_grad_()
-    optimiser = torch.optim.Adam([image], 0.05)
-    before = float((0.5 - target).abs().mean())
-    for _ in range(30):
-        optimiser.zero_grad()
-        loss(image, target).backward()
-        optimiser.step()
-    assert float((image.detach() - target).abs().mean()) < 0.6 * before
-
-
 def test_only_the_layers_asked_for_are_computed(vgg_file):
     assert len(load_perceptual(vgg_file, ["relu2_2"], [1.0]).network.features) == 9
 

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from capture_scenes import captured
-from fit_scenes import STATE, WHOLE, files, flags, logged, make_small, settings
+from fit_scenes import STATE, WHOLE, files, flags, logged, settings
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training.fit import MODEL, fit
 from safetensors.torch import load_file
 from support.runs import child_environment
+
+pytestmark = pytest.mark.usefixtures("small_fit")
 
 SCRIPT = Path(__file__).parents[1] / "fit_scenes.py"
 
@@ -20,11 +22,6 @@ SCRIPT = Path(__file__).parents[1] / "fit_scenes.py"
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory):
     return captured(tmp_path_factory.mktemp("captures"), people=3, frames=2, passes=("img", "mask"))
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    make_small(monkeypatch)
 
 
 def launched(*words: str) -> subprocess.CompletedProcess:

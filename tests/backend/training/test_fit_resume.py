@@ -10,9 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from capture_scenes import captured
 from fit_scenes import STATE, WHOLE, files, logged, make_small, settings, stop_after
-from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training import loop
 from primdiffusion.training.fit import MODEL, fit
@@ -23,12 +21,8 @@ from primdiffusion.training.state import TrainingState
 from safetensors import safe_open
 from support.errors import refused
 from support.runs import same_tensors, sentence, timeless
-from tiny_encoder import TINY
 
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
+pytestmark = pytest.mark.usefixtures("small_fit")
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +33,6 @@ def whole(captures, tmp_path_factory):
         config = settings(captures, tmp_path_factory.mktemp("whole") / "run")
         fit(config)
         return config.run
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    make_small(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -165,17 +154,6 @@ def test_captures_and_run_may_move(captures, begun, tmp_path):
     (tmp_path / "link").symlink_to(captures)
     begun.run.rename(tmp_path / "moved")
     assert fit(settings(tmp_path / "link", tmp_path / "moved", steps=2)).card["steps"] == 2
-
-
-def test_a_state_of_another_encoder_is_rejected_in_one_sentence(captures, begun, tmp_path):
-    other = settings(captures, tmp_path / "other", steps=1, encoder="paper")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "paper", TINY)
-        fit(other)
-    (begun.run / STATE).write_bytes((other.run / STATE).read_bytes())
-    with refused(ValueError, "network") as error:
-        fit(settings(captures, begun.run, steps=2))
-    assert len(sentence(error.value)) < 500
 
 
 def test_another_number_of_processes_is_reported(captures, begun, caplog):

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from capture_scenes import captured
 from fit_scenes import make_small, settings
 from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.reader import open_captures
@@ -23,13 +22,10 @@ from primdiffusion.training.fit_voxels import FittedVoxels, fit_missing, read_fi
 from support.errors import refused
 from support.runs import rows
 
+pytestmark = pytest.mark.usefixtures("small_fit")
+
 NAMES = ("person_000000", "person_000001")
 VOXELS_ALONE = LossConfig(rgb=0.0, silhouette=0.0, voxels=1.0)
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +37,6 @@ def fitted(captures, tmp_path_factory) -> Path:
         patch.setattr(fit_voxels, "SIDE", 48)
         fit_missing(open_captures(captures), PRESETS["default"], folder)
     return folder
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    make_small(monkeypatch)
 
 
 def drawn_voxels(extent: float = 1.0) -> FittedVoxels:

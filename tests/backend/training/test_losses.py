@@ -1,7 +1,5 @@
 """Losses, noise levels and blends of the training of the diffusion model."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Muon for hidden layers beside AdamW for the others."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from primdiffusion.training import diffusion_task

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from capture_scenes import body_mesh, captured, save_person
+from capture_scenes import body_mesh, save_person
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.capture.conditioning import conditioning_views
@@ -116,15 +116,6 @@ def test_masks_alone_make_a_thin_person_in_black_solid():
     assert torch.equal(without.density, thin.payload.density)
 
 
-def test_the_inputs_are_left_alone(views):
-    start = person(2)
-    before = start.map(torch.clone)
-    refine(start, views, dataclasses.replace(QUICK, steps=2))
-    assert torch.equal(start.payload.rgb, before.payload.rgb)
-    assert torch.equal(start.payload.density, before.payload.density)
-    assert not start.payload.rgb.requires_grad
-
-
 def test_the_work_ends_when_time_is_over_and_when_its_owner_says_so(views):
     assert refine(person(2), views, dataclasses.replace(QUICK, seconds=0)).steps == 1
 
@@ -193,11 +184,6 @@ def test_cameras_are_held_out_evenly():
     assert sorted(held + given) == [0, 1, 2, 3, 4]
     with refused(ValueError, "0 to 3"):
         split_cameras(4, 4)
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("refined"), people=2, frames=2, passes=("img", "mask"))
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """The state of a training run: what is saved, restored and rejected."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from primdiffusion.files import tensor_file

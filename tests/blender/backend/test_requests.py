@@ -1,7 +1,5 @@
 """Errors of the child: advice on settings that cost memory."""
 
-from __future__ import annotations
-
 import pytest
 
 from blender_primdiffusion.backend.requests import error_text, memory_advice, sentence

@@ -1,7 +1,5 @@
 """Surfaces without a skeleton: bound to the body in their parameters' pose, brought to rest, and posed anew."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

@@ -1,7 +1,5 @@
 """The body in numpy: the backend's, to rounding."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import synthetic
@@ -99,11 +97,6 @@ def test_a_body_of_another_form_is_named(tmp_path, change, name):
     np.savez(tmp_path / "body.npz", **content)
     with refused(FileError, name):
         read_body(tmp_path / "body.npz")
-
-
-def test_a_missing_body_is_named(tmp_path):
-    with refused(FileError):
-        read_body(tmp_path / "none.npz")
 
 
 def rig_of(body, betas, off: float, seed: int = 0) -> dict[str, np.ndarray]:

@@ -1,7 +1,5 @@
 """The command `capture` reads its options as the panel does its settings."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Real Blenders on a real Ray cluster of two workers, one of which is killed on the way."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

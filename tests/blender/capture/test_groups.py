@@ -1,7 +1,5 @@
 """Groups of people in front of the same cameras, drawn by Cycles and read by the backend."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

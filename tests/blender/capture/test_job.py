@@ -1,7 +1,5 @@
 """A capture goes on after a kill, finds damage, and leaves nothing behind in Blender."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """Skinned people of other rigs, rests, units and axes: posed as the body is, whatever they came with."""
 
-from __future__ import annotations
-
 import json
 import struct
 
@@ -19,8 +17,6 @@ from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load, own_per
 from support.errors import refused
 
 from blender_primdiffusion.capture.scan import Scan
-
-HANDS = np.isin(BODY.skin_weights.argmax(1), [JOINT_NAMES.index("left_hand"), JOINT_NAMES.index("right_hand")])
 
 
 def bone_heads(scan: Scan) -> np.ndarray:

@@ -1,7 +1,5 @@
 """The same person through both programs: cameras and joints do not depend on who draws the pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

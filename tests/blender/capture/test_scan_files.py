@@ -1,7 +1,5 @@
 """Folders of scans: who is in them, by what name, with which colours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

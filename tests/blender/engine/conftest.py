@@ -1,7 +1,5 @@
 """A human of the backend, the extension registered once for a file of tests, and a marcher on the GPU."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace

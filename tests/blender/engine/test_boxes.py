@@ -1,7 +1,5 @@
 """Boxes placed in Blender are where the backend puts them; people's files are read or rejected in one sentence."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import subprocess

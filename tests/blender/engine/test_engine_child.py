@@ -21,7 +21,7 @@ from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.engine import drawing_child
-from blender_primdiffusion.engine.drawing_child import CHANNELS, SharedFrames, frames
+from blender_primdiffusion.engine.drawing_child import SharedFrames, frames
 from blender_primdiffusion.engine.engine import render_layer
 
 pytestmark = pytest.mark.any_blender
@@ -285,23 +285,6 @@ def test_ending_blender_during_a_picture_leaves_no_process(how):
         assert not Path(folder).exists()
     else:
         shutil.rmtree(Path(folder).parent)  # as all of a killed Blender's temporary files
-
-
-def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
-    frames = SharedFrames()
-    try:
-        first = frames.take(8, 4)
-        assert first.path.stat().st_size == 8 * 4 * CHANNELS * 4
-        first.combined[:], first.depth[:] = 1.0, 2.0
-        assert frames.take(8, 4) is first
-        second = frames.take(4, 4)
-        assert not first.path.exists()
-        assert second.path.exists()
-        assert not second.combined.any()
-        assert (first.depth == 2.0).all()  # still mapped
-    finally:
-        frames.close()
-    assert not second.path.parent.exists()
 
 
 def test_a_full_disk_is_an_error_that_leaves_no_file(monkeypatch):

@@ -1,7 +1,5 @@
 """People over a picture of Cycles', the documented way: a linked scene with holdouts, put on top by Alpha Over."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import bpy

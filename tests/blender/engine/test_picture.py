@@ -1,7 +1,5 @@
 """The engine's pictures are the backend's, pixel for pixel, however the camera is set and the armature is moved."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

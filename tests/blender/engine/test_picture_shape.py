@@ -1,7 +1,5 @@
 """A reshaped person in the render engine is the backend's own picture of that body in that pose."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Solid objects in the engine's pictures: which ones, where, in what colours; before, behind and inside a person."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import bpy

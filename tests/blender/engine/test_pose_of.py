@@ -1,7 +1,5 @@
 """What the engine reads of a posed armature is SMPL's pose, wherever the armature has its origin."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """A Rendered view: what it says where it cannot be drawn, and which picture goes over Blender's overlays."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Who draws humans in which 3D view, and that the engines that are said to render volumes do."""
 
-from __future__ import annotations
-
 import bpy
 import pytest
 

@@ -1,7 +1,5 @@
 """People as assets: marked with words and a picture, brought into other files with everything they need."""
 
-from __future__ import annotations
-
 import json
 from unittest.mock import MagicMock
 
@@ -14,7 +12,6 @@ from support.errors import refused
 from support.fake_child import PICTURE
 
 from blender_primdiffusion.scene.human import MARK, humans
-from blender_primdiffusion.scene.volume_nodes import volumes_of
 from blender_primdiffusion.ui import export_panel
 
 ops = bpy.ops.primdiffusion
@@ -69,30 +66,6 @@ def test_unmarking_leaves_the_person(person):
         assert bpy.ops.asset.clear_single() == {"FINISHED"}
     assert person.asset_data is None
     assert humans(bpy.context.scene) == [person]
-
-
-@pytest.mark.parametrize("link", [False, True])
-def test_another_file_finds_the_data_of_a_person_it_appends_or_links(person, tmp_path, link):
-    ops.mark_as_asset()
-    bpy.ops.wm.save_mainfile()
-    library = bpy.data.filepath
-    (tmp_path / "elsewhere").mkdir()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere" / "other.blend"))
-    operator = bpy.ops.wm.link if link else bpy.ops.wm.append
-    operator(directory=f"{library}/Collection/", filename="Human", **({"instance_collections": False} if link else {}))
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    (person,) = humans(bpy.context.scene)
-    assert volumes_of(person) is not None
-    assert person_file(person).is_file()
-    assert person.pose.bones["head"]
-    assert (person.library is not None) == link
-    if link:
-        with refused(RuntimeError, "linked"):
-            ops.mark_as_asset()
-        with bpy.context.temp_override(id=person):
-            assert not bpy.ops.asset.clear_single.poll()
 
 
 def test_what_cannot_be_an_asset_is_reported(addon):

@@ -1,7 +1,5 @@
 """Jobs about a person find the person's file when their turn comes, wherever it is by then."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

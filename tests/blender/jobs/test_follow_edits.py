@@ -8,11 +8,10 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
-from human_files import folder_of, forget_session_files, paths_of, person_file, remove_human
+from human_files import folder_of, forget_session_files, paths_of, person_file
 from jobs_driven import drive, error_of, notice_of
 from oracle import evaluated_matrices
 
-from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import EditJob, GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -77,39 +76,6 @@ def current() -> bpy.types.Object:
     return humans(bpy.context.scene)[0]
 
 
-def test_a_new_human_enters_in_one_undo_step(generated):
-    assert not bpy.data.armatures
-    drive()
-    assert person_file(current()).is_file()
-    bpy.ops.ed.undo()
-    assert not humans(bpy.context.scene)
-    assert not bpy.data.volumes
-    bpy.ops.ed.redo()
-    assert person_file(current()).is_file()
-
-
-def test_an_edit_enters_in_one_undo_step(varied):
-    before = paths_of(varied)
-    drive()
-    after = paths_of(current())
-    assert not set(before) & set(after)
-    bpy.ops.ed.undo()
-    assert paths_of(current()) == before
-    check_whole(current())
-    bpy.ops.ed.redo()
-    assert paths_of(current()) == after
-    check_whole(current())
-
-
-def test_undo_and_redo_meanwhile_do_no_harm(generated):
-    generated.scene.collection.objects.link(bpy.data.objects.new("Cube", None))
-    bpy.ops.ed.undo_push(message="a cube")
-    for step in (bpy.ops.ed.undo, bpy.ops.ed.redo, bpy.ops.ed.undo):
-        step()
-    drive()
-    assert person_file(current()).is_file()
-
-
 def test_a_name_taken_meanwhile_is_left(generated):
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("Human", None))
     drive()
@@ -120,43 +86,6 @@ def test_another_file_loaded_meanwhile_gets_no_human(generated):
     bpy.ops.wm.read_homefile(use_empty=True)
     drive()
     assert not humans(bpy.context.scene)
-
-
-def test_a_scene_deleted_meanwhile_gets_no_human(generated):
-    bpy.data.scenes.new("Other")
-    bpy.data.scenes.remove(generated.scene)
-    drive()
-    assert "was deleted meanwhile" in error_of("generate")
-
-
-def test_nothing_enters_while_the_user_holds_something(generated, monkeypatch):
-    monkeypatch.setattr(follow_module, "blocking_activity", lambda: "Move")
-    for _ in range(20):
-        assert follow() is not None
-    assert not humans(bpy.context.scene)
-    monkeypatch.undo()
-    drive()
-    assert len(humans(bpy.context.scene)) == 1
-
-
-def test_queued_humans_do_not_disturb_each_other(addon):
-    for seed in (11, 12, 13):
-        queue.add(addon, GenerateJob(seed, {"steps": 1}))
-    drive()
-    assert len({folder_of(person) for person in humans(bpy.context.scene)}) == 3
-
-
-def test_a_human_removed_meanwhile_is_reported(varied):
-    remove_human(varied)
-    drive()
-    assert "was removed during the edit" in error_of("vary")
-
-
-def test_a_person_renamed_meanwhile_is_edited(varied):
-    varied.name = "Anna"
-    drive()
-    assert error_of("vary") == ""
-    check_whole(varied)
 
 
 def test_undo_that_makes_the_person_another_meanwhile_rejects_the_result(person):

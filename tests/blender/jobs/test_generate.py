@@ -1,7 +1,5 @@
 """Generate and Cancel as the user meets them, with the real client and a child that can be told to misbehave."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -65,17 +63,6 @@ def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
     assert asked == [(first, generate.FIRST_HUMAN_SHARE), (second, 0.0)]
 
 
-def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
-    bpy.ops.ed.undo_push(message="before")
-    bpy.ops.primdiffusion.generate(seed=7)
-    bpy.ops.ed.undo()
-    assert not humans(bpy.context.scene)
-    assert not bpy.data.objects
-    bpy.ops.ed.redo()
-    assert len(humans(bpy.context.scene)) == 1
-    assert not queue.busy
-
-
 @pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("seed", "sentence"),
@@ -104,12 +91,6 @@ def test_a_killed_child_is_reported(addon):
     drive()
     assert "killed by the system" in error_of("generate")
     assert not humans(addon.scene)
-
-
-def test_a_second_click_is_queued_and_does_not_disturb_the_first(addon):
-    ask(addon, 7, 2)
-    assert bpy.ops.primdiffusion.generate(seed=8) == {"FINISHED"}
-    assert len(humans(addon.scene)) == 2
 
 
 def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_result(addon):

@@ -1,7 +1,5 @@
 """Timers change data at safe moments alone, and never outside an undo step."""
 
-from __future__ import annotations
-
 import time
 from types import SimpleNamespace
 
@@ -155,18 +153,6 @@ def test_what_a_failure_leaves_is_an_undo_step(addon, resting_at_once, monkeypat
     bpy.ops.ed.undo()
     assert "left behind" not in bpy.data.meshes
     assert names() == {"before", "one"}
-
-
-def test_a_failure_that_changed_nothing_makes_no_step(addon, resting_at_once, monkeypatch):
-    def fail(*_given):
-        raise ValueError("the disk is full")
-
-    monkeypatch.setattr(GenerateJob, "finish", fail)
-    steps("before", "one")
-    queue.add(addon, GenerateJob(11, {"steps": 1}))
-    drive()
-    bpy.ops.ed.undo()
-    assert names() == {"before"}
 
 
 def test_a_failure_that_left_edit_mode_can_be_undone(addon, resting_at_once, monkeypatch):

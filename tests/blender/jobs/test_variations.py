@@ -1,7 +1,5 @@
 """The contact sheet: people of many seeds, seen before anything is built, and exactly those that are then built."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -203,17 +201,6 @@ def test_as_many_pictures_stand_side_by_side_as_fit(width, columns):
     number, units = variations_panel._columns(SimpleNamespace(preferences=preferences, region=region))
     assert number == columns
     assert number * units * 20 <= max(width, 100)
-
-
-def test_icons_are_of_files_that_are_there_and_can_be_freed_again_and_again(shown_people):
-    for variation in (*sheet.variations, sheet.variations[0]):
-        icons.of(variation.picture)
-    assert len(icons._previews) == 4, "numbers of icons are all 0 without a window"
-    assert icons.of(None) == icons.of(Path("/nowhere.png")) == 0
-    icons.free()
-    icons.free()
-    icons.of(sheet.variations[0].picture)
-    assert len(icons._previews) == 1
 
 
 @pytest.mark.parametrize("end", ["clear", "load", "unregister"])

@@ -1,7 +1,5 @@
 """Merging and the gain from the operator to what is shown, with the real child and a person of a small model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

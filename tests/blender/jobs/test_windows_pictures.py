@@ -1,7 +1,5 @@
 """Pictures in panels."""
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

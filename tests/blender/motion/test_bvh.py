@@ -1,7 +1,5 @@
 """BVH files of other rigs, other rests, other units and Euler orders: the same motion on SMPL's skeleton."""
 
-from __future__ import annotations
-
 import re
 
 import bpy

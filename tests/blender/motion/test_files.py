@@ -1,7 +1,5 @@
 """Files of poses as people have them, and files that hold something else."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
@@ -117,14 +115,6 @@ def test_a_matrix_is_a_rotation_within_a_thousandth_or_a_sentence(tmp_path, endi
             read_motion(path)
 
 
-def test_rotation_matrices_are_read(tmp_path):
-    matrices = from_axis_angle(THETA)
-    np.savez(tmp_path / "p.npz", global_orient=matrices[:, :1], body_pose=matrices[:, 1:])
-    np.save(tmp_path / "p.npy", matrices)
-    np.testing.assert_allclose(read_motion(tmp_path / "p.npz").rotations, matrices, atol=1e-9)
-    np.testing.assert_allclose(read_motion(tmp_path / "p.npy").rotations, matrices, atol=1e-9)
-
-
 @pytest.mark.parametrize("shape", [(FRAMES, 72), (FRAMES, 24, 3)])
 def test_npy_of_many_frames_is_read(tmp_path, shape):
     np.save(tmp_path / "p.npy", THETA.reshape(shape))
@@ -206,11 +196,6 @@ def test_files_that_are_broken_are_named(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with refused(FileError, str(tmp_path / name)):
         read_motion(tmp_path / name)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with refused(FileError):
-        read_motion(tmp_path / "none.npz")
 
 
 def bomb(claimed: tuple[int, ...], size: int) -> bytes:

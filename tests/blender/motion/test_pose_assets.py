@@ -1,7 +1,5 @@
 """The pose library: Blender finds our poses, applies them to any human and flips them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

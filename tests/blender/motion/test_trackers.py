@@ -1,7 +1,5 @@
 """Outputs of trackers of people and of Kimodo: one level down, several people, frame by frame, of joblib and pickle."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from pathlib import Path

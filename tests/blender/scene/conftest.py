@@ -1,7 +1,5 @@
 """A human with files on the disk."""
 
-from __future__ import annotations
-
 import bpy
 import pytest
 import synthetic_shape

@@ -1,7 +1,5 @@
 """The skeleton: SMPL's bones, and poses that are SMPL's whatever the bones' own axes are."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What a .blend holds is read by one module, and what it rejects is what no human has."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import importlib

@@ -1,7 +1,5 @@
 """A person replaced in place: what an edit left alone is untouched, and undo finds every file it needs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -122,27 +120,6 @@ def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved
     vertices = np.array([vertex.co for vertex in body.data.vertices]) - raised(arrays["vertices"])[:3, 3]
     np.testing.assert_allclose(vertices, blended_vertices(arrays, rotations, np.zeros(3)), atol=2e-5)
     np.testing.assert_allclose(list(armature[BETAS]), arrays["betas"], atol=1e-6)
-
-
-def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
-    bpy.ops.ed.undo_push(message="before")
-    places = transforms(person)
-    replace(person, reshaped(tmp_path))
-    assert transforms(person) != places
-    bpy.ops.ed.undo_push(message="edit")
-    bpy.ops.ed.undo()
-    assert transforms(humans(bpy.context.scene)[0]) == places
-
-
-def test_a_shape_the_user_chose_stays_while_the_betas_do(person, saved_scene, tmp_path):
-    person[BETAS] = [2.0] * 10
-    replace(person, redyed(tmp_path, 3))
-    assert list(person[BETAS]) == [2.0] * 10
-
-
-def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene, tmp_path):
-    body_of(person).shape_key_add(name="Basis")
-    assert "changed by hand" in replace(person, reshaped(tmp_path)).warning
 
 
 def test_a_duplicate_that_shares_data_is_not_edited_with_the_original(person, saved_scene, tmp_path):

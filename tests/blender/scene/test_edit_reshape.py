@@ -1,7 +1,5 @@
 """A person reshaped in the scene: bones, mesh and volumes go where the new body has them, the pose stays."""
 
-from __future__ import annotations
-
 import json
 
 import bpy
@@ -16,7 +14,7 @@ from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import BETAS, MARK, body_of, humans
+from blender_primdiffusion.scene.human import BETAS, MARK, body_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
 
 COUNT = 12
@@ -104,13 +102,6 @@ def test_soles_on_the_floor_stay_there(person, saved_scene, scale):
     assert lowest(person) == pytest.approx(0, abs=1e-5)
 
 
-def test_a_human_on_a_table_still_stands_on_it_in_another_shape(person, saved_scene):
-    person.location = (1.0, 2.0, 0.75)
-    saved_scene.view_layer.update()
-    reshape(person, SHAPE)
-    assert lowest(person) == pytest.approx(0.75, abs=1e-5)
-
-
 def test_mode_selection_scenes_and_objects_stay_as_they_were(person, saved_scene):
     armature = person
     saved_scene.view_layer.objects.active = armature
@@ -157,18 +148,6 @@ def test_what_cannot_be_reshaped_is_rejected_untouched(person, saved_scene, sent
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_an_appended_person_finds_the_file_of_their_body(person, tmp_path):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=False) as (_, wanted):
-        wanted.collections = ["Human"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    (appended,) = humans(bpy.context.scene)
-    reshape(appended, SHAPE)
-    np.testing.assert_allclose(heads(appended), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
-
-
 def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person):
     body_of(person).shape_key_add(name="Basis")
     assert "'Human_body' was changed by hand" in reshape(person, SHAPE)
@@ -194,13 +173,6 @@ def test_a_custom_shape_survives_an_edit_that_changes_the_shape(person, tmp_path
     assert json.loads(person[MARK])["seed"] == 9
     np.testing.assert_allclose(generated_betas(person), 1)
     reshape(person, generated_betas(person))
-    assert not has_custom_shape(person)
-
-
-def test_a_shape_that_was_not_chosen_follows_the_edit(person, tmp_path):
-    assert replace(person, edited_file(tmp_path, SHAPE)).reshaped
-    np.testing.assert_allclose(betas_of(person), SHAPE)
-    np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
     assert not has_custom_shape(person)
 
 

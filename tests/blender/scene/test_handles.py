@@ -1,7 +1,5 @@
 """IK handles: the pose stays when they are added and baked, feet stay on the floor, and other readers of bones."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """A reshaped person's .human file: the sizes that boxes have on the body of now."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

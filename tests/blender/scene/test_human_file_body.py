@@ -1,7 +1,5 @@
 """The body of a human: in a file beside the human's, or the default one."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """A human's file: a sentence says what is wrong with it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """People are whole after undo and edits, in linked and appended files, and after Blender's own copies."""
 
-from __future__ import annotations
-
 import os
 
 import bpy
@@ -9,7 +7,7 @@ import numpy as np
 import psutil
 import pytest
 import synthetic_shape
-from human_files import copy_of, forget_session_files, person_file, press_x
+from human_files import forget_session_files, person_file, press_x
 from human_stage import named, places, whole
 from support.errors import refused
 from support.fake_child import request_of
@@ -136,15 +134,6 @@ def test_blenders_own_duplicate_of_all_parts(person):
     assert len(bpy.context.selected_objects) == 3  # all but what stands in without the extension
     bpy.data.batch_remove([obj for obj in bpy.context.selected_objects])
     assert whole(person, where)
-
-
-def test_a_duplicate_of_the_armature_and_two_people(person):
-    where = places(person)
-    copy_of(person)
-    ops.vary(human="Anna.001", seed=14)
-    assert whole(named(), where)
-    assert whole(named("Anna.001"))
-    assert person_file(named()) != person_file(named("Anna.001"))
 
 
 @pytest.mark.parametrize("kind", ["LINK_COPY", "FULL_COPY"])

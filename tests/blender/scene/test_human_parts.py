@@ -1,7 +1,5 @@
 """Parts of humans follow what Blender does to armatures: deleted with them, made for copies; undo leads back."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import bpy

@@ -1,7 +1,5 @@
 """A person as one volume: what the files hold, what is shown, names, stale poses, material."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 

@@ -1,7 +1,5 @@
 """Where a new human stands: near the 3D cursor, at its height, clear of humans and solid objects."""
 
-from __future__ import annotations
-
 import bpy
 import pytest
 import synthetic

@@ -1,7 +1,5 @@
 """Armature and mesh proxy as glTF, FBX and USD: what was written is read back and compared."""
 
-from __future__ import annotations
-
 import bpy
 import exporting
 import numpy as np

@@ -1,7 +1,5 @@
 """What is seen of a person in each mode: by Cycles, pixel for pixel, and by the engine, who draws armatures."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from blender_primdiffusion.scene.merged import MergedGrid, MergedState, merged_f
 from blender_primdiffusion.scene.representation import set_representation
 
 COUNT = 6
-SIZE = 64
 
 
 @pytest.fixture

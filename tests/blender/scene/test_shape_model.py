@@ -1,7 +1,5 @@
 """Shape in the extension is shape in the backend: surface, joints, frames, measures, on the default body."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Splats: where Blender's nodes put them on a posed body, by the oracles; edits, copies, undo, appending, removal."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """VDB files: their content, where it lies, and that a failed write leaves nothing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

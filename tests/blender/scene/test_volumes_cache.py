@@ -1,7 +1,5 @@
 """Memory of volumes that are gone."""
 
-from __future__ import annotations
-
 import bpy
 import psutil
 import synthetic

@@ -1,7 +1,5 @@
 """A synthetic human for the tests of its panels."""
 
-from __future__ import annotations
-
 import bpy
 import pytest
 import synthetic

@@ -1,7 +1,5 @@
 """Asking for attributes: menus of what the checkpoint knows, from its header; nothing is asked for unless chosen."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Render Captures as a user and a script press it, on a person in a .glb."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The sidebar as it opens: tabs, panels, heights, reasons beside grey buttons; text wrapped in panels."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Editing the selected person as the user meets it, with the real client and a child that can be told to misbehave."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -212,17 +210,6 @@ def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
     drive()
     assert error_of("vary") == ""
     assert not set(paths_of(humans(bpy.context.scene)[0])) & set(before)
-
-
-def test_undo_of_an_earlier_edit_during_the_job_rejects_the_result(person):
-    before = paths_of(person)
-    ops.vary(seed=FINE)
-    start(person, FINE + 1)
-    until_running()
-    bpy.ops.ed.undo()
-    drive()
-    assert "changed during the edit" in error_of("vary")
-    assert paths_of(humans(bpy.context.scene)[0]) == before
 
 
 def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(addon, tmp_path):

@@ -1,7 +1,5 @@
 """The edits from the operator to the human's file, with the real child and a small model."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

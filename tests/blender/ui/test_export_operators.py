@@ -1,7 +1,5 @@
 """Exports and imports by operators, with a child that has a synthetic person ready."""
 
-from __future__ import annotations
-
 import functools
 import json
 from types import SimpleNamespace

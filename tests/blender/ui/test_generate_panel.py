@@ -1,7 +1,5 @@
 """The panel Generate: seeds, counts, quality, presets, and people who stand side by side."""
 
-from __future__ import annotations
-
 import itertools
 import random
 import re

@@ -1,7 +1,5 @@
 """Import Motion: timing, root, bones, what is rejected, and what the file browser shows."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from types import SimpleNamespace

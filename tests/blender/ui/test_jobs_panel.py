@@ -1,7 +1,5 @@
 """The panel Jobs, and what cancel says."""
 
-from __future__ import annotations
-
 import bpy
 import pytest
 from jobs_driven import drive, shown

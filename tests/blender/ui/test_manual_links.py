@@ -1,7 +1,5 @@
 """The manual: made of docs/manual for the zip, opened by panels and by F1, without a network."""
 
-from __future__ import annotations
-
 import re
 import sys
 import webbrowser

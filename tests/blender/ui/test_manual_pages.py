@@ -1,7 +1,5 @@
 """The manual as its readers meet it: every picture and section is there, and pictures are small."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Built-in motions, appending, strips, loops, export and the Motion panel, as the user meets them."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

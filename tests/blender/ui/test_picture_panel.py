@@ -1,7 +1,5 @@
 """Human from Picture as the user meets it, with the real client and a child that moves an arm and the pelvis."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Human from Captures as the user meets it, with the real client and a child that can be told to misbehave."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

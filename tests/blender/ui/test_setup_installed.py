@@ -1,7 +1,5 @@
 """The installed zip sets up its backend for real, with torch, and generates with it; slow, and needs an index."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

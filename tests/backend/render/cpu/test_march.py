@@ -174,20 +174,6 @@ def test_agrees_within_spans(settings):
     assert_agree(boxes, camera, settings, Span(near, far))
 
 
-def test_spans_that_meet_put_a_picture_together():
-    """Thin rays are sums, so what is drawn up to half a metre and from there on is the whole."""
-    boxes, camera = random_boxes(30, 23, density=3.0), camera_at((0.2, 0.1, 0.6), fov=0.5).to(dtype=torch.float32)
-    single = boxes.to(dtype=torch.float32)
-    cut = torch.full((camera.height, camera.width), 0.6404)  # between two lattice points
-    front = march_cpu(single, camera, span=Span(torch.zeros_like(cut), cut))
-    back = march_cpu(single, camera, span=Span(cut, torch.full_like(cut, torch.inf)))
-    whole = march_cpu(single, camera)
-    assert whole.alpha.max() < 1
-    assert front.alpha.max() > 0.01
-    assert back.alpha.max() > 0.01
-    torch.testing.assert_close(front.rgb + back.rgb, whole.rgb, rtol=0, atol=1e-6)
-
-
 def test_thousands_of_boxes_over_one_pixel_are_all_seen():
     """No list has room for so many and no more: the opacity of all of them adds up."""
     count = 20_000

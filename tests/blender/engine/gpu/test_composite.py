@@ -1,7 +1,5 @@
 """Marched pictures in a 3D view: behind and before its objects, clipped, transparent, beneath bones in front."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The GPU's marcher draws what the backend's marcher draws."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import gpu

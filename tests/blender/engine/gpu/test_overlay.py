@@ -1,7 +1,5 @@
 """What 3D views show of humans beside Blender's objects, and whom a click selects. `test_composite` draws."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Humans, solid objects and background on the GPU are composited as the child composites them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
