@@ -47,7 +47,7 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.raster.multisample import figure_from_mesh
+from primdiffusion.raster.rasterise import figure_from_mesh
 from primdiffusion.reconstruction.from_captures import reconstruct
 from primdiffusion.reconstruction.from_pictures import fit_posture_in, person_in, start_of
 from primdiffusion.reconstruction.posture_fit import Posture
