@@ -109,7 +109,7 @@ def main() -> None:
                 fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
             start = given(case, photograph, model, Fault(), number)
             began = time.perf_counter()
-            posture = fit_posture_in(model, [photograph], start, lambda: None)
+            posture = fit_posture_in(model, [photograph], start, lambda: None).posture
             human = reconstruct(model, person_in([photograph], posture))
             seconds = time.perf_counter() - began
             views = aligned(case, human)
@@ -121,7 +121,7 @@ def main() -> None:
                 "picture_seconds_cpu": seconds,
             }
             if not number % POSES:
-                standing = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
+                standing = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None).posture
                 row["camera_error_px_standing"] = camera_error(case, photograph, standing)
             for fault_name, fault in FAULTS.items() if number < arguments.robust else ():
                 error, quality = with_fault(model, case, Path(scratch) / f"{name}_{fault_name}", fault, number)
@@ -171,7 +171,7 @@ def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, se
     """Camera error and PSNR."""
     photograph = photographed(case, folder, fault)
     start = given(case, photograph, model, fault, seed)
-    posture = fit_posture_in(model, [photograph], start, lambda: None)
+    posture = fit_posture_in(model, [photograph], start, lambda: None).posture
     human = reconstruct(model, person_in([photograph], posture))
     return camera_error(case, photograph, posture), psnr(human, case, aligned(case, human))
 

@@ -89,7 +89,7 @@ def main() -> None:
             case = drawn(assets, number, Path(scratch))
             began = time.perf_counter()
             start = start_of([case.photograph], model)
-            posture = fit_posture_in(model, [case.photograph], start, lambda: None)
+            posture = fit_posture_in(model, [case.photograph], start, lambda: None).posture
             seconds = time.perf_counter() - began
             human = reconstruct(model, person_in([case.photograph], posture))
             row = errors(case, posture) | {"front_psnr": front_psnr(human, case, posture), "fit_seconds_cpu": seconds}

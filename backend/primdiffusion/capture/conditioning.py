@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,6 +60,8 @@ class CapturedPerson:
     """Messages for the user about problems of the captures or pictures."""
     whole_views: tuple[View, ...] = ()
     """Cameras of plain pictures, as found; those of `views` see squares cut out of them."""
+    fit: Mapping[str, Any] | None = None
+    """How well the posture explains plain pictures, as posture.json holds it: `FitQuality.content`."""
 
 
 def captured_person(

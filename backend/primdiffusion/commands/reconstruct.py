@@ -60,7 +60,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         if request.capture is None:
             model = session.model(request.checkpoint)
             person = person_in_pictures(model, *_files(request), refine=request.refine, on_step=on_step)
-            write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views)
+            write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views, person.fit)
             if len(request.pictures) == 1:
                 warnings.append("only one picture: the sides that it does not show are guessed")
         else:
@@ -79,6 +79,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         **of_capture,
         frame=person.frame,
         posture=None if request.capture else request.out_dir / POSTURE_FILE,
+        fit=person.fit and person.fit["percent"],
         seed=request.seed,
         warnings=[*warnings, *person.warnings],
         seconds=round(time.perf_counter() - began, 3),
@@ -95,9 +96,10 @@ def fit_posture(request: FitPostureRequest, session: Session, report: ReportProg
         model = session.model(request.checkpoint)
         report("read", 0, 1, None)
         person = person_in_pictures(model, *_files(request), on_step=_steps(report, POSTURE_STEPS))
-        write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views)
+        write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views, person.fit)
     seconds, warnings = round(time.perf_counter() - began, 3), list(person.warnings)
-    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, seconds=seconds, warnings=warnings)
+    fit = person.fit and person.fit["percent"]
+    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, fit=fit, seconds=seconds, warnings=warnings)
 
 
 def refine_human(command: RefineCommand, session: Session, report: ReportProgress) -> None:

@@ -21,7 +21,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
-from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
+from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of, without_things
 from primdiffusion.reconstruction.posture_start import (
     STANDING_ARMS,
     before_cameras,
@@ -49,8 +49,6 @@ ROUNDS = (Round(96, Stage(60, 0.04, upright=False), 2), Round(96, Stage(80, 0.02
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
-LEAST_OVERLAP = 0.8
-"""Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -67,6 +65,14 @@ class Start:
     """Pose and cameras are those of files."""
     tilted: bool
     """See `PostureFit`."""
+
+
+class Found(NamedTuple):
+    """What a fit found in pictures."""
+
+    posture: Posture
+    photographs: Sequence[Photograph]
+    """The pictures, without the parts of their masks that are no person's."""
 
 
 def person_in_pictures(
@@ -94,20 +100,17 @@ def person_in_pictures(
     photographs = read_photographs(list(map(Path, pictures)), list(map(Path, masks)), mask_label=mask_label)
     known = (None if path is None else Path(path) for path in (pose, cameras))
     start, warnings = start_of(photographs, model, *known), []
-    posture = start.posture
+    found = Found(start.posture, photographs)
     if refine:
-        posture = fit_posture_in(model, photographs, start, on_step)
+        found = fit_posture_in(model, photographs, start, on_step)
     elif not start.complete:
         raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
     if pose is None:
         warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
-    overlap = outline_overlap(model, photographs, posture)
-    if overlap < LEAST_OVERLAP:
-        warnings.append(
-            f"the fitted body and the masks overlap by {100 * overlap:.0f} %: the pose was probably not found; give a "
-            "pose file that is nearer"
-        )
-    return person_in(photographs, posture, warnings)
+    quality = fit_quality(model, photographs, found)
+    return dataclasses.replace(
+        person_in(found.photographs, found.posture, [*warnings, *quality.warnings()]), fit=quality.content()
+    )
 
 
 def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Sequence[str] = ()) -> CapturedPerson:
@@ -158,28 +161,34 @@ def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: S
 
 def fit_posture_in(
     model: DiffusionModel, photographs: Sequence[Photograph], start: Start, on_step: Callable[[], None]
-) -> Posture:
-    """The posture in the pictures; deterministic.
+) -> Found:
+    """The posture in the pictures; deterministic. Things that no body explains are left out of the last round.
 
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
     components = PersonComponents.of(model)
     fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
-    for side, stage, coefficient_steps in ROUNDS:
+    for number, (side, stage, coefficient_steps) in enumerate(ROUNDS):
         payload = components.payload(components.coefficients(people))
-        fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)
+        targets = _targets(photographs, fit.posture(), side)
+        if 0 < number == len(ROUNDS) - 1:
+            pairs = zip(photographs, targets, strict=True)
+            photographs = [without_things(payload, photograph, target) for photograph, target in pairs]
+            targets = _targets(photographs, fit.posture(), side)
+        fit.refine(payload, targets, stage, on_step)
         targets = _targets(photographs, fit.posture(), side)
         for _ in range(coefficient_steps):
             people = components.closer(people, targets)
             on_step()
-    return fit.posture()
+    return Found(fit.posture(), photographs)
 
 
-def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> float:
-    """Intersection over union of the mean human in the posture and the masks."""
-    components = PersonComponents.of(model)
-    targets = _targets(photographs, posture, ROUNDS[0].side)
-    return overlap_of(components.payload(components.coefficients(components.everyone())), targets)
+def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
+    """How well what was found explains the pictures. Raises ValueError as `PersonComponents.of`."""
+    areas = [[one.rgba[..., 3].sum(dtype=np.float64) for one in each] for each in (found.photographs, photographs)]
+    left_out = max(1 - kept / area for kept, area in zip(*areas, strict=True))
+    targets = _targets(found.photographs, found.posture, ROUNDS[0].side)
+    return quality_of(PersonComponents.of(model), found.posture, targets, left_out)
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:
