@@ -110,11 +110,13 @@ def main() -> None:
     report({name: round(float(value), 3) for name, value in figures.items()} | {"people": len(rows)}, arguments.json)
 
 
-def drawn(assets, number: int, folder: Path) -> Case:
-    """Draw a human, save the picture with alpha, and read it."""
+def drawn(assets, number: int, folder: Path, turned: float = 0.0) -> Case:
+    """Draw a human, turned by so many degrees about the vertical, save the picture with alpha, and read it."""
     person, rng = make_person(assets, load_base_mesh(), SEED + number), np.random.default_rng(number)
     names = list(built_in_vectors())
     pose = built_in_poses().map(lambda values: values[names.index(POSES[number % len(POSES)])])
+    turn = axis_angle_to_matrix(torch.tensor([0.0, math.radians(turned), 0.0]))
+    pose = BodyPose(torch.cat([turn @ pose.joint_rotation[:1], pose.joint_rotation[1:]]), pose.translation)
     body = default_body().shape(torch.from_numpy(person.betas).float())
     floor = body.pose(pose).vertices[:, 1].min()
     posed = body.pose(BodyPose(pose.joint_rotation, torch.tensor([0.0, -float(floor), 0.0])))

@@ -190,7 +190,8 @@ def without_things(payload: Payload, photograph: Photograph, target: PosedView) 
     if not parts.any():
         return photograph
     gone = (_grown(parts, CLOTHES * int((target.rgba[..., 3] > 0.5).any(1).sum())) & (drawn < 0.5)).numpy()
-    side, block = len(photograph.rgba), math.ceil(len(photograph.rgba) / len(gone))
+    side = len(photograph.rgba)
+    block = side // len(gone)  # pixels of the target are means over blocks
     large = np.kron(gone, np.ones((block, block), bool))
     large = np.pad(large, [(0, max(0, side - len(large)))] * 2, mode="edge")[:side, :side]
     return dataclasses.replace(photograph, rgba=photograph.rgba * ~large[..., None])

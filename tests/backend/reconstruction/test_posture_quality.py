@@ -85,6 +85,16 @@ def test_a_ball_is_left_out_whole_and_the_human_is_kept():
     assert "belongs to no body" in found.warnings()[0]
 
 
+def test_parts_are_left_out_of_the_large_picture_where_they_are_in_the_small_one():
+    photograph, _ = with_ball()
+    _, target = seen()
+    rgba = torch.from_numpy(photograph.rgba.astype(np.float32) / 255)
+    large = np.pad(photograph.rgba.repeat(6, 0).repeat(6, 1), [(0, 2), (0, 2), (0, 0)])  # 96 x 6 + 2 pixels
+    kept = without_things(PAYLOAD, dataclasses.replace(photograph, rgba=large), dataclasses.replace(target, rgba=rgba))
+    same = without_things(PAYLOAD, photograph, dataclasses.replace(target, rgba=rgba))
+    assert np.array_equal(kept.rgba[: 6 * SIDE : 6, : 6 * SIDE : 6], same.rgba)
+
+
 def test_what_is_explained_is_left_as_it_is():
     photograph, target = seen()
     assert without_things(PAYLOAD, photograph, target) is photograph
