@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
@@ -62,6 +62,8 @@ class CapturedPerson:
     """Cameras of plain pictures, as found; those of `views` see squares cut out of them."""
     fit: Mapping[str, Any] | None = None
     """How well the posture explains plain pictures, as posture.json holds it: `FitQuality.content`."""
+    masks_made: tuple[UInt8[np.ndarray, "H W"], ...] = ()
+    """Masks of whole pictures that had none, of upright pixels."""
 
 
 def captured_person(

@@ -13,15 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.cut_out import load_opencv
+from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph, read_photographs
-from primdiffusion.capture.reader import Views
+from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.primitives.primitives import Payload
 from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
-from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
-from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of, without_things
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error, resized
+from primdiffusion.reconstruction.posture_masks import cut_by_outline, outline_in, without_things
+from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
 from primdiffusion.reconstruction.posture_start import (
     STANDING_ARMS,
     before_cameras,
@@ -49,6 +54,8 @@ ROUNDS = (Round(96, Stage(60, 0.04, upright=False), 2), Round(96, Stage(80, 0.02
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
+OUTLINE_IN_PICTURE = 256
+"""Largest side of the drawing of a body over a picture without a mask, pixels."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -97,20 +104,29 @@ def person_in_pictures(
 
     Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
     """
-    photographs = read_photographs(list(map(Path, pictures)), list(map(Path, masks)), mask_label=mask_label)
-    known = (None if path is None else Path(path) for path in (pose, cameras))
+    known = [None if path is None else Path(path) for path in (pose, cameras)]
+    photographs = read_photographs(
+        list(map(Path, pictures)),
+        list(map(Path, masks)),
+        mask_label=mask_label,
+        outline=None if pose is None or len(pictures) > 1 else lambda *size: _body_in(model, *known, size),
+    )
     start, warnings = start_of(photographs, model, *known), []
-    found = Found(start.posture, photographs)
     if refine:
         found = fit_posture_in(model, photographs, start, on_step)
     elif not start.complete:
         raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
+    else:
+        targets = _targets(photographs, start.posture, ROUNDS[-1].side)
+        found = Found(start.posture, _cut_out(_mean_human(model), photographs, targets))
     if pose is None:
         warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
     quality = fit_quality(model, photographs, found)
-    return dataclasses.replace(
-        person_in(found.photographs, found.posture, [*warnings, *quality.warnings()]), fit=quality.content()
-    )
+    masks_made = tuple(one.whole_mask() for one in found.photographs if one.uncut is not None)
+    if masks_made:
+        warnings.append("the picture has no mask: the person was cut out by the outline of the body; look at mask.png")
+    person = person_in(found.photographs, found.posture, [*warnings, *quality.warnings()])
+    return dataclasses.replace(person, fit=quality.content(), masks_made=masks_made)
 
 
 def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Sequence[str] = ()) -> CapturedPerson:
@@ -171,10 +187,14 @@ def fit_posture_in(
     for number, (side, stage, coefficient_steps) in enumerate(ROUNDS):
         payload = components.payload(components.coefficients(people))
         targets = _targets(photographs, fit.posture(), side)
+        if number in (0, len(ROUNDS) - 1):
+            photographs = _cut_out(payload, photographs, targets)
         if 0 < number == len(ROUNDS) - 1:
             pairs = zip(photographs, targets, strict=True)
-            photographs = [without_things(payload, photograph, target) for photograph, target in pairs]
-            targets = _targets(photographs, fit.posture(), side)
+            photographs = [
+                one if one.uncut is not None else without_things(payload, one, target) for one, target in pairs
+            ]
+        targets = _targets(photographs, fit.posture(), side)
         fit.refine(payload, targets, stage, on_step)
         targets = _targets(photographs, fit.posture(), side)
         for _ in range(coefficient_steps):
@@ -185,10 +205,45 @@ def fit_posture_in(
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
     """How well what was found explains the pictures. Raises ValueError as `PersonComponents.of`."""
-    areas = [[one.rgba[..., 3].sum(dtype=np.float64) for one in each] for each in (found.photographs, photographs)]
-    left_out = max(1 - kept / area for kept, area in zip(*areas, strict=True))
+    pairs = zip(found.photographs, photographs, strict=True)
+    left_out = max(1 - _area(kept) / _area(one) if kept.uncut is None else 0.0 for kept, one in pairs)
     targets = _targets(found.photographs, found.posture, ROUNDS[0].side)
     return quality_of(PersonComponents.of(model), found.posture, targets, left_out)
+
+
+def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Sequence[PosedView]) -> list[Photograph]:
+    """The photographs; the persons of those without a mask are cut out again, by the human's outline."""
+    pairs = zip(photographs, targets, strict=True)
+    return [one if one.uncut is None else cut_by_outline(payload, one, target) for one, target in pairs]
+
+
+def _mean_human(model: DiffusionModel) -> Payload:
+    components = PersonComponents.of(model)
+    return components.payload(components.coefficients(components.everyone()))
+
+
+def _body_in(
+    model: DiffusionModel, pose_path: Path, cameras_path: Path | None, size: tuple[int, int]
+) -> UInt8[np.ndarray, "H W"]:
+    """255 near the body of a posture in a picture of this width and height that has no mask."""
+    load_opencv()
+    known = read_posture(pose_path, [size])
+    views = known.views if cameras_path is None else read_cameras(cameras_path, [size])
+    if views is None:
+        raise ValueError(
+            "the picture has neither alpha nor a mask, and the pose no camera, so the person cannot be cut out: give "
+            "one of them"
+        )
+    camera, scale = as_camera(views[0]), min(1.0, OUTLINE_IN_PICTURE / max(size))
+    small = dataclasses.replace(camera, width=round(scale * size[0]), height=round(scale * size[1]))
+    betas = model.shapes.bias if known.betas is None else known.betas
+    posture = Posture(repeated(known.pose, 1), betas, stack([resized(camera, scale, small)]))
+    return outline_in(_mean_human(model), posture, size)
+
+
+def _area(photograph: Photograph) -> float:
+    """Of the person, in pixels; 1 where nobody is left."""
+    return max(1.0, photograph.rgba[..., 3].sum(dtype=np.float64) / 255)
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:

@@ -2,7 +2,7 @@
 
 The human is drawn in its posture, with the colours that explain the pictures best. What counts is how far outlines and
 colours differ, whether limbs lie within the mask and hands are where they were put, and whether knees and elbows bend
-as they can. Parts of a mask that no body explains, such as a bag or a chair, are left out of a fit.
+as they can.
 """
 
 from __future__ import annotations
@@ -13,14 +13,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from scipy import ndimage
+from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.photograph import Photograph
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.geometry.srgb import encode_srgb
@@ -28,6 +25,7 @@ from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchor
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.reconstruction.from_captures import PersonComponents
 from primdiffusion.reconstruction.posture_fit import COARSE, Posture, each
+from primdiffusion.reconstruction.posture_masks import grown, unexplained
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 
@@ -47,10 +45,6 @@ COLOUR_STEPS = 2
 """Gauss-Newton steps to the person coefficients that draw the colours."""
 EDGE_PX = 1
 """Difference of outlines that does not count, pixels of the small pictures that are compared."""
-CLOTHES = 0.03
-"""Width around the human, as a share of its height, in which a mask may be larger: hair, wide sleeves and hems."""
-LEAST_PART = 0.012
-"""Share of the mask from which a part that no body explains is left out."""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
 """How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {
@@ -145,7 +139,7 @@ def quality_of(
 def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: float) -> FitQuality:
     seen, opacity = march(Primitives.place(target.frames, payload), target.camera, COARSE), target.rgba[..., 3]
     mask, drawn = opacity > 0.5, seen.alpha > 0.5
-    wrong = (mask & ~_grown(drawn, EDGE_PX)) | (drawn & ~_grown(mask, EDGE_PX))
+    wrong = (mask & ~grown(drawn, EDGE_PX)) | (drawn & ~grown(mask, EDGE_PX))
     differs = (encode_srgb(seen.rgb.clamp(1e-4, 1)) - encode_srgb(target.rgba[..., :3].clamp(1e-4, 1))).abs().mean(-1)
     inside = differs[(opacity > 0.9) & (seen.alpha > 0.9)]
     outside, hand = {}, 0.0
@@ -166,35 +160,6 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
         joint=_strain(pose),
         limb=limb,
     )
-
-
-def _grown(mask: Bool[Tensor, "H W"], reach: float) -> Bool[Tensor, "H W"]:
-    """All pixels within `reach` of a mask."""
-    return torch.from_numpy(ndimage.distance_transform_edt(~mask.numpy()) <= reach) if mask.any() else mask
-
-
-def unexplained(drawn: Float[Tensor, "H W"], opacity: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-    """Parts of a mask, each of some size, that lie farther from the human drawn than wide clothes do."""
-    mask = opacity > 0.5
-    beyond = mask & ~_grown(drawn > 0.5, CLOTHES * int(mask.any(1).sum()))
-    labels, count = ndimage.label(ndimage.binary_opening(beyond.numpy(), np.ones((2, 2))))
-    large = [number for number in range(1, count + 1) if (labels == number).sum() > LEAST_PART * int(mask.sum())]
-    return torch.from_numpy(np.isin(labels, large))
-
-
-@torch.no_grad()
-def without_things(payload: Payload, photograph: Photograph, target: PosedView) -> Photograph:
-    """The photograph without the parts of its mask that the human does not explain; itself if there are none."""
-    drawn = march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha
-    parts = unexplained(drawn, target.rgba[..., 3])
-    if not parts.any():
-        return photograph
-    gone = (_grown(parts, CLOTHES * int((target.rgba[..., 3] > 0.5).any(1).sum())) & (drawn < 0.5)).numpy()
-    side = len(photograph.rgba)
-    block = side // len(gone)  # pixels of the target are means over blocks
-    large = np.kron(gone, np.ones((block, block), bool))
-    large = np.pad(large, [(0, max(0, side - len(large)))] * 2, mode="edge")[:side, :side]
-    return dataclasses.replace(photograph, rgba=photograph.rgba * ~large[..., None])
 
 
 def _limbs_drawn(payload: Payload, target: PosedView) -> dict[str, Float[Tensor, "H W"]]:

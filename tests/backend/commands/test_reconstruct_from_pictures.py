@@ -81,6 +81,21 @@ def test_the_posture_can_be_used_again_without_refining(line, tmp_path):
     assert np.allclose(before["cameras"]["camera0000"]["K"], after["cameras"]["camera0000"]["K"], atol=0.05)
 
 
+def test_a_photograph_without_a_mask_is_cut_out_by_the_body_posed_over_it(line, picture, tmp_path, capsys):
+    pytest.importorskip("cv2")
+    cli.main(line)
+    posture = shutil.copy(tmp_path / "out" / "posture.json", tmp_path / "posture.json")
+    cut = Image.open(picture)
+    plain = Image.new("RGB", cut.size, (40, 160, 60))
+    plain.paste(cut, mask=cut)
+    plain.save(tmp_path / "plain.png")
+    cli.main(["reconstruct", str(tmp_path / "plain.png"), *line[2:], "--pose", str(posture)])
+    assert "look at mask.png" in capsys.readouterr().err
+    mask, true = np.asarray(Image.open(tmp_path / "out" / "mask.png")) > 127, np.asarray(cut)[..., 3] > 127
+    assert mask.shape == true.shape
+    assert (mask & true).sum() / (mask | true).sum() > 0.9
+
+
 def test_seeds_vary_the_human_and_repeat(line, tmp_path):
     payloads = []
     for seed in ("1", "2", "1"):

@@ -17,7 +17,8 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reconstruction.from_captures import PersonComponents
 from primdiffusion.reconstruction.from_pictures import Found, fit_quality
 from primdiffusion.reconstruction.posture_fit import Posture
-from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, FitQuality, without_things
+from primdiffusion.reconstruction.posture_masks import without_things
+from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, FitQuality
 from primdiffusion.reconstruction.posture_start import standing
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
