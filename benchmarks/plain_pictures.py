@@ -26,6 +26,8 @@ from a standing start; a fit is reported if it is below 85 % or left a part of t
 
     failed_fits_reported           share of the spoiled pictures (SPOILED) that are reported
     good_fits_reported             share of the good pictures that are reported though nothing is wrong
+    cutout_iou, cutout_iou_worst   intersection over union of the true mask and of the one that is cut out of a good
+                                   picture over a generated background, by the outline of the fitted body
 
 The sheet has a row for each human: picture, ours in the picture, then two others beside the true ones.
 """
@@ -65,10 +67,11 @@ from primdiffusion.reconstruction.from_pictures import (
     fit_posture_in,
     fit_quality,
     person_in,
+    person_in_pictures,
     start_of,
 )
 from primdiffusion.reconstruction.posture_fit import Posture
-from primdiffusion.reconstruction.posture_start import framed, views_of
+from primdiffusion.reconstruction.posture_start import framed, views_of, write_posture
 from primdiffusion.render.march import march
 from record import command_line, report
 from scipy import ndimage
@@ -162,7 +165,7 @@ def main() -> None:
 
 def reported(model: DiffusionModel, assets: Assets, count: int) -> dict[str, float | int]:
     """Figures of fits that say that they failed, of `count` spoiled pictures."""
-    kinds, said = [*SPOILED, GOOD], {True: [], False: []}
+    kinds, said, overlaps = [*SPOILED, GOOD], {True: [], False: []}, []
     with tempfile.TemporaryDirectory() as scratch:
         for number in range(count + count // (len(SPOILED) - 1)):
             kind, seed = kinds[number % len(kinds)], number // len(kinds) + number % len(kinds)
@@ -175,13 +178,45 @@ def reported(model: DiffusionModel, assets: Assets, count: int) -> dict[str, flo
             found = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
             quality = fit_quality(model, [photograph], found)
             said[kind != GOOD].append(bool(quality.warnings()))
+            if kind == GOOD:
+                overlaps.append(cutout_iou(model, rgba, photograph, found.posture, Path(scratch), number))
             print(kind, seed, quality.content(), flush=True)
     return {
         "failed_fits_reported": round(float(np.mean(said[True])), 3),
         "good_fits_reported": round(float(np.mean(said[False])), 3),
+        "cutout_iou": round(float(np.mean(overlaps)), 3),
+        "cutout_iou_worst": round(float(np.min(overlaps)), 3),
         "spoiled_pictures": len(said[True]),
         "good_pictures": len(said[False]),
     }
+
+
+def cutout_iou(
+    model: DiffusionModel, rgba: np.ndarray, photograph: Photograph, posture: Posture, folder: Path, seed: int
+) -> float:
+    """How well the person is cut out of the picture over a background, by the outline of the posture."""
+    share, behind = rgba[..., 3:] / 255, background(*rgba.shape[:2], np.random.default_rng(seed))
+    picture = (rgba[..., :3] * share + behind * (1 - share)).clip(0, 255).astype(np.uint8)
+    Image.fromarray(picture).save(folder / "opaque.png")
+    write_posture(folder / "posture.json", posture.pose, posture.betas, views_of([photograph], posture.camera))
+    person = person_in_pictures(model, [folder / "opaque.png"], pose=folder / "posture.json", refine=False)
+    found, true = person.masks_made[0] > 127, rgba[..., 3] > 127
+    return float((found & true).sum() / (found | true).sum())
+
+
+def background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Noise of four sizes, with a grain of its own, and up to eight shaded rectangles: walls, doors, furniture."""
+    out = rng.uniform(40, 215, 3) + np.zeros((height, width, 3))
+    for size in (320, 80, 20, 4):
+        small = rng.normal(size=(max(2, height // size), max(2, width // size), 3))
+        layers = [
+            Image.fromarray(layer.astype(np.float32)).resize((width, height)) for layer in small.transpose(2, 0, 1)
+        ]
+        out += np.dstack([np.asarray(layer) for layer in layers]) * rng.uniform(1, 15)
+    for _ in range(rng.integers(2, 9)):
+        (top, bottom), (left, right) = np.sort(rng.integers(0, height, 2)), np.sort(rng.integers(0, width, 2))
+        out[top:bottom, left:right] = out[top:bottom, left:right] * rng.uniform(0.3, 0.8) + rng.uniform(0, 150, 3)
+    return out
 
 
 def unspoiled(rgba: np.ndarray, _case: upright.Case, _rng: np.random.Generator) -> np.ndarray:

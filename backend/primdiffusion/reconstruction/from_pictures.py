@@ -96,7 +96,8 @@ def person_in_pictures(
     """The person in plain pictures, for `reconstruct`; the fields of `requests.Pictures` say what the files are.
 
     Pose, shape and cameras are refined from those of the files, or of a standing body; otherwise both files are needed.
-    `on_step` is called POSTURE_STEPS times while refining; an exception that it raises cancels. Deterministic.
+    A single picture that has neither alpha nor a mask is cut out by the outline of the body, if the pose file has its
+    camera. `on_step` is called POSTURE_STEPS times while refining; an exception that it raises cancels. Deterministic.
 
         >>> person = pd.person_in_pictures(model, ["anna.png"])
         >>> person.betas.shape

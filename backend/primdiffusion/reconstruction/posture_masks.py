@@ -55,7 +55,10 @@ def without_things(payload: Payload, photograph: Photograph, target: PosedView) 
 
 @torch.no_grad()
 def cut_by_outline(payload: Payload, photograph: Photograph, target: PosedView) -> Photograph:
-    """The person of an uncut photograph, cut out by the outline of the human in the small picture of the target."""
+    """The person of an uncut photograph, cut out by the outline of the human in the small picture of the target.
+
+    Where the human is not in the picture, the photograph stays as it is.
+    """
     assert photograph.uncut is not None
     drawn = march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha.numpy()
     side = len(photograph.rgba)
@@ -63,7 +66,8 @@ def cut_by_outline(payload: Payload, photograph: Photograph, target: PosedView) 
     size = len(drawn) * block
     large = np.asarray(Image.fromarray(drawn).resize((size, size), Image.Resampling.BILINEAR))
     outline = np.pad(large, [(0, side - size)] * 2, mode="edge") > 0.5
-    return photograph.with_mask(cut_out(photograph.uncut[..., :3], outline))
+    mask = cut_out(photograph.uncut[..., :3], outline)
+    return photograph.with_mask(mask) if mask.any() else photograph
 
 
 @torch.no_grad()
