@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
@@ -33,7 +33,7 @@ LEAST_PERCENT = 85
 """A fit below has probably failed; one of `LIMITS` is reached."""
 LIMITS: Mapping[str, float] = {
     "outline": 0.03,
-    "colour": 0.115,
+    "colour": 0.08,
     "unexplained": 0.03,
     "left_out": 0.1,
     "outside": 0.28,
@@ -45,6 +45,8 @@ COLOUR_STEPS = 2
 """Gauss-Newton steps to the person coefficients that draw the colours."""
 EDGE_PX = 1
 """Difference of outlines that does not count, pixels of the small pictures that are compared."""
+PATTERN_PX = 7
+"""Side of the squares over which colours are compared, in the same pixels: patterns cannot be drawn."""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
 """How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {
@@ -65,7 +67,7 @@ class FitQuality(NamedTuple):
     outline: float
     """1 - intersection over union of the outlines, but for their edges."""
     colour: float
-    """Difference of encoded colour that nine tenths of the pixels do not exceed."""
+    """Difference of encoded colour, means over small squares, that nine tenths of the pixels do not exceed."""
     unexplained: float
     """Share of the mask that is no part of the human, even with wide clothes."""
     left_out: float
@@ -140,8 +142,9 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
     seen, opacity = march(Primitives.place(target.frames, payload), target.camera, COARSE), target.rgba[..., 3]
     mask, drawn = opacity > 0.5, seen.alpha > 0.5
     wrong = (mask & ~grown(drawn, EDGE_PX)) | (drawn & ~grown(mask, EDGE_PX))
-    differs = (encode_srgb(seen.rgb.clamp(1e-4, 1)) - encode_srgb(target.rgba[..., :3].clamp(1e-4, 1))).abs().mean(-1)
-    inside = differs[(opacity > 0.9) & (seen.alpha > 0.9)]
+    difference = encode_srgb(seen.rgb.clamp(1e-4, 1)) - encode_srgb(target.rgba[..., :3].clamp(1e-4, 1))
+    differs, inner = difference.abs().mean(-1), (opacity > 0.9) & (seen.alpha > 0.9)
+    inside = _mean_around(difference, inner).abs().mean(-1)[inner]
     outside, hand = {}, 0.0
     for limb, share in _limbs_drawn(payload, target).items():
         within = share * mask
@@ -160,6 +163,13 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
         joint=_strain(pose),
         limb=limb,
     )
+
+
+def _mean_around(values: Float[Tensor, "H W 3"], inner: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+    """Means over the pixels of the figure in squares, in which stripes and checks are one colour."""
+    weights = torch.cat([values * inner[..., None], inner[..., None].float()], -1).movedim(-1, 0)[None]
+    sums = torch.nn.functional.avg_pool2d(weights, PATTERN_PX, stride=1, padding=PATTERN_PX // 2)[0]
+    return (sums[:3] / sums[3:].clamp_min(1e-6)).movedim(0, -1)
 
 
 def _limbs_drawn(payload: Payload, target: PosedView) -> dict[str, Float[Tensor, "H W"]]:
