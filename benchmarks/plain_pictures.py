@@ -21,6 +21,14 @@ And of the first --robust humans, camera error (camera_error_px_...) and PSNR (p
     pose_10, pose_20 joints turned by 10 and 20 degrees
     turned_10       the whole body turned by 10 degrees about the vertical besides
 
+With `--spoiled N`, N spoiled pictures and a quarter as many good ones of the humans of `upright.py`, by tilted cameras,
+from a standing start; a fit is reported if it is below 85 % or left a part of the mask out:
+
+    failed_fits_reported           share of the spoiled pictures (SPOILED) that are reported
+    good_fits_reported             share of the good pictures that are reported though nothing is wrong
+    cutout_iou, cutout_iou_worst   intersection over union of the true mask and of the one that is cut out of a good
+                                   picture over a generated background, by the outline of the fitted body
+
 The sheet has a row for each human: picture, ours in the picture, then two others beside the true ones.
 """
 
@@ -35,26 +43,39 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import upright
 from figure_metrics import figure_psnr
 from from_pictures import GREY, POSES, VIEW, Case, captured, case_of, over_grey
 from jaxtyping import Float
 from PIL import Image
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
+from primdiffusion.people.assets import Assets, open_assets
+from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.reconstruction.from_captures import reconstruct
-from primdiffusion.reconstruction.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, person_in, start_of
+from primdiffusion.reconstruction.from_pictures import (
+    POSE_FILE_TIGHTNESS,
+    Start,
+    fit_posture_in,
+    fit_quality,
+    person_in,
+    person_in_pictures,
+    start_of,
+)
 from primdiffusion.reconstruction.posture_fit import Posture
-from primdiffusion.reconstruction.posture_start import framed, views_of
+from primdiffusion.reconstruction.posture_start import framed, views_of, write_posture
 from primdiffusion.render.march import march
 from record import command_line, report
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 DEGREES = 5.0
@@ -98,6 +119,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--robust", type=int, default=4, help="humans for the figures of faults")
     parser.add_argument("--sheet", type=Path, help="PNG of the humans")
+    parser.add_argument("--spoiled", type=int, default=0, help="spoiled pictures")
     arguments = parser.parse_args()
     model, rows, sheet = load_checkpoint(arguments.checkpoint), [], []
     with tempfile.TemporaryDirectory() as scratch:
@@ -109,7 +131,7 @@ def main() -> None:
                 fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
             start = given(case, photograph, model, Fault(), number)
             began = time.perf_counter()
-            posture = fit_posture_in(model, [photograph], start, lambda: None)
+            posture = fit_posture_in(model, [photograph], start, lambda: None).posture
             human = reconstruct(model, person_in([photograph], posture))
             seconds = time.perf_counter() - began
             views = aligned(case, human)
@@ -121,7 +143,7 @@ def main() -> None:
                 "picture_seconds_cpu": seconds,
             }
             if not number % POSES:
-                standing = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
+                standing = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None).posture
                 row["camera_error_px_standing"] = camera_error(case, photograph, standing)
             for fault_name, fault in FAULTS.items() if number < arguments.robust else ():
                 error, quality = with_fault(model, case, Path(scratch) / f"{name}_{fault_name}", fault, number)
@@ -134,9 +156,153 @@ def main() -> None:
         name: round(float(np.mean([row[name] for row in rows if name in row])), 3) for name in names
     }
     figures |= {"people": len(rows), "people_with_faults": min(arguments.robust, len(rows))}
+    if arguments.spoiled:
+        figures |= reported(model, open_assets(arguments.assets, required_meshes()), arguments.spoiled)
     if arguments.sheet is not None:
         Image.fromarray(np.concatenate(sheet)).save(arguments.sheet, quality=88)
     report(figures, arguments.json)
+
+
+def reported(model: DiffusionModel, assets: Assets, count: int) -> dict[str, float | int]:
+    """Figures of fits that say that they failed, of `count` spoiled pictures."""
+    kinds, said, overlaps = [*SPOILED, GOOD], {True: [], False: []}, []
+    with tempfile.TemporaryDirectory() as scratch:
+        for number in range(count + count // (len(SPOILED) - 1)):
+            kind, seed = kinds[number % len(kinds)], number // len(kinds) + number % len(kinds)
+            path = Path(scratch) / f"{number}.png"
+            case = upright.drawn(assets, seed, Path(scratch), turned=180.0 if kind == "behind" else 0.0)
+            rgba = np.array(Image.open(case.photograph.path))
+            spoil = SPOILED.get(kind, unspoiled)
+            Image.fromarray(spoil(rgba, case, np.random.default_rng(number))).save(path)
+            (photograph,) = read_photographs([path])
+            found = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
+            quality = fit_quality(model, [photograph], found)
+            said[kind != GOOD].append(bool(quality.warnings()))
+            if kind == GOOD:
+                overlaps.append(cutout_iou(model, rgba, photograph, found.posture, Path(scratch), number))
+            print(kind, seed, quality.content(), flush=True)
+    return {
+        "failed_fits_reported": round(float(np.mean(said[True])), 3),
+        "good_fits_reported": round(float(np.mean(said[False])), 3),
+        "cutout_iou": round(float(np.mean(overlaps)), 3),
+        "cutout_iou_worst": round(float(np.min(overlaps)), 3),
+        "spoiled_pictures": len(said[True]),
+        "good_pictures": len(said[False]),
+    }
+
+
+def cutout_iou(
+    model: DiffusionModel, rgba: np.ndarray, photograph: Photograph, posture: Posture, folder: Path, seed: int
+) -> float:
+    """How well the person is cut out of the picture over a background, by the outline of the posture."""
+    share, behind = rgba[..., 3:] / 255, background(*rgba.shape[:2], np.random.default_rng(seed))
+    picture = (rgba[..., :3] * share + behind * (1 - share)).clip(0, 255).astype(np.uint8)
+    Image.fromarray(picture).save(folder / "opaque.png")
+    write_posture(folder / "posture.json", posture.pose, posture.betas, views_of([photograph], posture.camera))
+    person = person_in_pictures(model, [folder / "opaque.png"], pose=folder / "posture.json", refine=False)
+    found, true = person.masks_made[0] > 127, rgba[..., 3] > 127
+    return float((found & true).sum() / (found | true).sum())
+
+
+def background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Noise of four sizes, with a grain of its own, and up to eight shaded rectangles: walls, doors, furniture."""
+    out = rng.uniform(40, 215, 3) + np.zeros((height, width, 3))
+    for size in (320, 80, 20, 4):
+        small = rng.normal(size=(max(2, height // size), max(2, width // size), 3))
+        layers = [
+            Image.fromarray(layer.astype(np.float32)).resize((width, height)) for layer in small.transpose(2, 0, 1)
+        ]
+        out += np.dstack([np.asarray(layer) for layer in layers]) * rng.uniform(1, 15)
+    for _ in range(rng.integers(2, 9)):
+        (top, bottom), (left, right) = np.sort(rng.integers(0, height, 2)), np.sort(rng.integers(0, width, 2))
+        out[top:bottom, left:right] = out[top:bottom, left:right] * rng.uniform(0.3, 0.8) + rng.uniform(0, 150, 3)
+    return out
+
+
+def unspoiled(rgba: np.ndarray, _case: upright.Case, _rng: np.random.Generator) -> np.ndarray:
+    return rgba
+
+
+def with_thing(rgba: np.ndarray, rng: np.random.Generator, row: float, thing: Callable) -> np.ndarray:
+    """A striped thing beside the figure, at a share `row` of its height from its top."""
+    mask, (rows, columns) = rgba[..., 3], np.mgrid[: rgba.shape[0], : rgba.shape[1]]
+    top, height = extent(mask)
+    edges, right = np.flatnonzero(mask[int(top + height * row)] > 127), bool(rng.integers(2))
+    inside = thing(rows - top - height * row, (columns - edges[-1]) if right else (edges[0] - columns), height)
+    inside &= mask < 128
+    stripes = ((rows + columns) // 12 % 2 * 40)[..., None] + rng.integers(0, 215, 3)
+    return np.where(inside[..., None], np.dstack([stripes, np.full_like(mask, 255)]), rgba).astype(np.uint8)
+
+
+def with_ball(rgba: np.ndarray, _case: upright.Case, rng: np.random.Generator) -> np.ndarray:
+    radius = rng.uniform(0.07, 0.13)
+    return with_thing(
+        rgba, rng, rng.uniform(0.4, 0.9), lambda y, x, h: y**2 + (x - 0.7 * radius * h) ** 2 < (radius * h) ** 2
+    )
+
+
+def with_chair(rgba: np.ndarray, _case: upright.Case, rng: np.random.Generator) -> np.ndarray:
+    width = rng.uniform(0.15, 0.25)
+    return with_thing(
+        rgba, rng, 0.75, lambda y, x, h: (np.abs(y) < 0.24 * h) & (np.abs(x - 0.4 * width * h) < width * h / 2)
+    )
+
+
+def without_limb(rgba: np.ndarray, case: upright.Case, rng: np.random.Generator) -> np.ndarray:
+    """The mask lacks an arm or a lower leg: pixels whose nearest vertex belongs to it."""
+    limb = list(LIMBS.values())[rng.integers(len(LIMBS))]
+    joints = [JOINT_NAMES.index(name) for name in limb]
+    pixels = case.view.project(case.posed.vertices.numpy())[0]
+    places = np.argwhere(rgba[..., 3] > 0)
+    nearest = cKDTree(pixels).query(places[:, ::-1] + 0.5)[1]
+    gone = np.isin(default_body().skin_weights.argmax(1).numpy()[nearest], joints)
+    out = rgba.copy()
+    out[tuple(places[gone].T)] = 0
+    return out
+
+
+def wrong_mask(rgba: np.ndarray, _case: upright.Case, rng: np.random.Generator) -> np.ndarray:
+    """The mask is moved aside or down, too large, or a rectangle, in a picture with a chequered background."""
+    mask, (rows, columns) = rgba[..., 3], np.mgrid[: rgba.shape[0], : rgba.shape[1]]
+    height, box = extent(mask)[1], np.zeros_like(mask)
+    box[ndimage.find_objects((mask > 127).astype(int))[0]] = 255
+    moves = [(0, 0.06 * height), (0, -0.06 * height), (0.08 * height, 0)]
+    masks = [ndimage.shift(mask, move, order=0) for move in moves]
+    masks += [ndimage.maximum_filter(mask, int(0.05 * height)), box]
+    chequers = rng.integers(30, 220, 3) + ((rows // 30 + columns // 40) % 2 * 25)[..., None]
+    colours = np.where(mask[..., None] > 127, rgba[..., :3], chequers)
+    return np.dstack([colours, masks[rng.integers(len(masks))]]).astype(np.uint8)
+
+
+def half(rgba: np.ndarray, _case: upright.Case, rng: np.random.Generator) -> np.ndarray:
+    """Cut off between hips and knees."""
+    top, height = extent(rgba[..., 3])
+    out = rgba.copy()
+    out[int(top + height * rng.uniform(0.5, 0.72)) :] = 0
+    return out
+
+
+def extent(mask: np.ndarray) -> tuple[int, int]:
+    """First row and height of the figure."""
+    rows = np.flatnonzero((mask > 127).any(1))
+    return int(rows[0]), int(rows[-1] + 1 - rows[0])
+
+
+GOOD = "good"
+LIMBS = {
+    f"{side} {limb}": [f"{side}_{joint}" for joint in joints]
+    for side in ("left", "right")
+    for limb, joints in {"arm": ("shoulder", "elbow", "wrist", "hand"), "leg": ("knee", "ankle", "foot")}.items()
+}
+SPOILED: Mapping[str, Callable[[np.ndarray, upright.Case, np.random.Generator], np.ndarray]] = {
+    "ball": with_ball,
+    "limb": without_limb,
+    "mask": wrong_mask,
+    "half": half,
+    "chair": with_chair,
+    "behind": unspoiled,
+}
+"""Changes to a picture with alpha; the person in "behind" faces away."""
 
 
 def photographed(case: Case, folder: Path, fault: Fault) -> Photograph:
@@ -171,7 +337,7 @@ def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, se
     """Camera error and PSNR."""
     photograph = photographed(case, folder, fault)
     start = given(case, photograph, model, fault, seed)
-    posture = fit_posture_in(model, [photograph], start, lambda: None)
+    posture = fit_posture_in(model, [photograph], start, lambda: None).posture
     human = reconstruct(model, person_in([photograph], posture))
     return camera_error(case, photograph, posture), psnr(human, case, aligned(case, human))
 

@@ -47,7 +47,7 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.raster.multisample import figure_from_mesh
+from primdiffusion.raster.rasterise import figure_from_mesh
 from primdiffusion.reconstruction.from_captures import reconstruct
 from primdiffusion.reconstruction.from_pictures import fit_posture_in, person_in, start_of
 from primdiffusion.reconstruction.posture_fit import Posture
@@ -89,7 +89,7 @@ def main() -> None:
             case = drawn(assets, number, Path(scratch))
             began = time.perf_counter()
             start = start_of([case.photograph], model)
-            posture = fit_posture_in(model, [case.photograph], start, lambda: None)
+            posture = fit_posture_in(model, [case.photograph], start, lambda: None).posture
             seconds = time.perf_counter() - began
             human = reconstruct(model, person_in([case.photograph], posture))
             row = errors(case, posture) | {"front_psnr": front_psnr(human, case, posture), "fit_seconds_cpu": seconds}
@@ -110,11 +110,13 @@ def main() -> None:
     report({name: round(float(value), 3) for name, value in figures.items()} | {"people": len(rows)}, arguments.json)
 
 
-def drawn(assets, number: int, folder: Path) -> Case:
-    """Draw a human, save the picture with alpha, and read it."""
+def drawn(assets, number: int, folder: Path, turned: float = 0.0) -> Case:
+    """Draw a human, turned by so many degrees about the vertical, save the picture with alpha, and read it."""
     person, rng = make_person(assets, load_base_mesh(), SEED + number), np.random.default_rng(number)
     names = list(built_in_vectors())
     pose = built_in_poses().map(lambda values: values[names.index(POSES[number % len(POSES)])])
+    turn = axis_angle_to_matrix(torch.tensor([0.0, math.radians(turned), 0.0]))
+    pose = BodyPose(torch.cat([turn @ pose.joint_rotation[:1], pose.joint_rotation[1:]]), pose.translation)
     body = default_body().shape(torch.from_numpy(person.betas).float())
     floor = body.pose(pose).vertices[:, 1].min()
     posed = body.pose(BodyPose(pose.joint_rotation, torch.tensor([0.0, -float(floor), 0.0])))

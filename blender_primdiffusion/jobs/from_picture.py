@@ -131,6 +131,11 @@ def read_fitted(path: Path, size: tuple[int, int]) -> Fitted:
         )
 
 
+def fit_of(result: FitPostureAnswer | ReconstructAnswer) -> str:
+    """How well the body explains the picture; empty for other versions of the backend, which do not say."""
+    return "" if result.fit is None else f" (fit {result.fit} %)"
+
+
 @dataclasses.dataclass(frozen=True)
 class FitPictureJob(Job):
     """Fit to Picture."""
@@ -158,7 +163,8 @@ class FitPictureJob(Job):
         take_world_posture(person, fitted.pose, fitted.translation)
         if (camera := self.task.camera_now()) is not None:
             aim_at_picture(camera, fitted.view)
-        return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
+        notice = f"Fitted{fit_of(result)} in {result.seconds:.1f} s"
+        return " ".join(map(sentence, [notice, *result.warnings]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,7 +192,7 @@ class PictureJob(Job):
     def finish(self, context: bpy.types.Context, result: ReconstructAnswer, _folder: Path) -> str:
         assert result.posture is not None
         fitted = read_fitted(result.posture, self.task.size)
-        armature, notice = build_person(context, result, "Made")
+        armature, notice = build_person(context, result, f"Made{fit_of(result)}")
         armature.matrix_world = Matrix.Identity(4)
         context.view_layer.update()
         take_world_posture(armature, fitted.pose, fitted.translation)

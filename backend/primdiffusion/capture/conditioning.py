@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
@@ -59,6 +60,10 @@ class CapturedPerson:
     """Messages for the user about problems of the captures or pictures."""
     whole_views: tuple[View, ...] = ()
     """Cameras of plain pictures, as found; those of `views` see squares cut out of them."""
+    fit: Mapping[str, Any] | None = None
+    """How well the posture explains plain pictures, as posture.json holds it: `FitQuality.content`."""
+    masks_made: tuple[UInt8[np.ndarray, "H W"], ...] = ()
+    """Masks of whole pictures that had none, of upright pixels."""
 
 
 def captured_person(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,21 @@ class Photograph:
     height: int
     focal: float | None
     """Focal length in pixels of the upright picture, if it states its lens."""
+    uncut: UInt8[np.ndarray, "h w 4"] | None = None
+    """The square, opaque, of a picture without a mask, whose person is cut out by the outline of a body."""
+
+    def with_mask(self, mask: UInt8[np.ndarray, "h w"]) -> Photograph:
+        """The person of an uncut picture in another mask."""
+        assert self.uncut is not None
+        return dataclasses.replace(self, rgba=_over_black(self.uncut, np.minimum(mask, self.uncut[..., 3])))
+
+    def whole_mask(self) -> UInt8[np.ndarray, "H W"]:
+        """The mask in the upright picture."""
+        box = (round(self.window.left), round(self.window.top))
+        side = (round(self.window.width), round(self.window.height))
+        whole = Image.new("L", (self.width, self.height))
+        whole.paste(Image.fromarray(self.rgba[..., 3]).resize(side, Image.Resampling.BILINEAR), box)
+        return np.asarray(whole)
 
     def lens(self) -> View:
         """A level camera at the origin that sees the upright picture: the stated lens, or LONG_SIDE_DEGREES."""
@@ -71,11 +86,17 @@ class Photograph:
 
 
 def read_photographs(
-    pictures: Sequence[Path], masks: Sequence[Path] = (), side: int = LARGEST_SIDE, mask_label: int | None = None
+    pictures: Sequence[Path],
+    masks: Sequence[Path] = (),
+    side: int = LARGEST_SIDE,
+    mask_label: int | None = None,
+    outline: Callable[[int, int], UInt8[np.ndarray, "H W"]] | None = None,
 ) -> list[Photograph]:
     """Read pictures of one person, with a mask file for each or with alpha; squares of the same side.
 
-    `mask_label` is the person's in masks of several labels: the index in the palette, or else the grey value.
+    `outline` draws a body over an opaque picture without a mask file, of a width and height in pixels; it stands for
+    the mask of such a picture, which is kept `uncut`. `mask_label` is the person's in masks of several labels: the
+    index in the palette, or else the grey value.
 
     Raises:
         ValueError: there are not as many masks as pictures.
@@ -86,7 +107,7 @@ def read_photographs(
     if masks and len(masks) != len(pictures):
         raise ValueError(f"there are {len(masks)} masks for {len(pictures)} pictures: give one for each, or none")
     pairs = zip(pictures, masks or [None] * len(pictures), strict=True)
-    found = [_figure(path, mask, mask_label) for path, mask in pairs]
+    found = [_figure(path, mask, mask_label, outline) for path, mask in pairs]
     side = min(side, max(math.ceil(figure.window.width) for figure in found))
     return [_scaled(figure, side) for figure in found]
 
@@ -96,18 +117,31 @@ def _scaled(figure: Photograph, side: int) -> Photograph:
     window = figure.window
     left, top = max(math.floor(window.left), 0), max(math.floor(window.top), 0)
     inside = dataclasses.replace(window, left=window.left - left, top=window.top - top)
-    return dataclasses.replace(figure, rgba=resample(figure.rgba, inside, side))
+    uncut = None if figure.uncut is None else resample(figure.uncut, inside, side)
+    return dataclasses.replace(figure, rgba=resample(figure.rgba, inside, side), uncut=uncut)
 
 
-def _figure(path: Path, mask_path: Path | None, mask_label: int | None) -> Photograph:
+def _figure(
+    path: Path,
+    mask_path: Path | None,
+    mask_label: int | None,
+    outline: Callable[[int, int], UInt8[np.ndarray, "H W"]] | None,
+) -> Photograph:
     """A person before it is scaled."""
     with _picture(path) as picture:
         focal, bands = _focal_length(picture), picture.getbands()
         pixels = _upright(decoded(picture, "RGBA"), picture)
-    if mask_path is None:
+    uncut = mask_path is None and outline is not None and pixels[..., 3].min() == 255
+    if uncut and outline is not None:
+        mask = outline(pixels.shape[1], pixels.shape[0])
+    elif mask_path is None:
         mask = pixels[..., 3]
         if "A" not in bands and mask.min() == 255:
-            raise FileError(path, "does not tell who is meant", "give a picture with alpha, or a mask file for it")
+            raise FileError(
+                path,
+                "does not tell who is meant",
+                "give a picture with alpha, a mask file, or a body posed over it (a posture.json with its camera)",
+            )
         if mask.min() == 255:
             raise FileError(path, "is opaque everywhere", "cut the person out, or give a mask file for it")
     else:
@@ -125,7 +159,8 @@ def _figure(path: Path, mask_path: Path | None, mask_label: int | None) -> Photo
     rows = slice(max(math.floor(window.top), 0), min(math.ceil(window.top + window.height), height))
     columns = slice(max(math.floor(window.left), 0), min(math.ceil(window.left + window.width), width))
     rgba = _over_black(pixels[rows, columns], (mask * keep if keep.shape == mask.shape else mask)[rows, columns])
-    return Photograph(path, rgba, window, width, height, focal and focal * max(width, height))
+    focal = focal and focal * max(width, height)
+    return Photograph(path, rgba, window, width, height, focal, pixels[rows, columns] if uncut else None)
 
 
 @contextlib.contextmanager

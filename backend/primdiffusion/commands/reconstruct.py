@@ -7,8 +7,10 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
+from PIL import Image
 from torch import Tensor
 
 from primdiffusion.capture.conditioning import (
@@ -41,7 +43,7 @@ STAGES = 4
 """Load, read, encode, write."""
 ENCODER_VIEWS = 8
 """Images to encode for a start from the encoder."""
-POSTURE_FILE = "posture.json"
+POSTURE_FILE, MASK_FILE = "posture.json", "mask.png"
 
 
 def reconstruct(request: ReconstructRequest, session: Session, report: ReportProgress) -> ReconstructAnswer:
@@ -60,7 +62,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         if request.capture is None:
             model = session.model(request.checkpoint)
             person = person_in_pictures(model, *_files(request), refine=request.refine, on_step=on_step)
-            write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views)
+            _write_found(folder, person)
             if len(request.pictures) == 1:
                 warnings.append("only one picture: the sides that it does not show are guessed")
         else:
@@ -79,6 +81,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         **of_capture,
         frame=person.frame,
         posture=None if request.capture else request.out_dir / POSTURE_FILE,
+        fit=person.fit and person.fit["percent"],
         seed=request.seed,
         warnings=[*warnings, *person.warnings],
         seconds=round(time.perf_counter() - began, 3),
@@ -95,9 +98,10 @@ def fit_posture(request: FitPostureRequest, session: Session, report: ReportProg
         model = session.model(request.checkpoint)
         report("read", 0, 1, None)
         person = person_in_pictures(model, *_files(request), on_step=_steps(report, POSTURE_STEPS))
-        write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views)
+        _write_found(folder, person)
     seconds, warnings = round(time.perf_counter() - began, 3), list(person.warnings)
-    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, seconds=seconds, warnings=warnings)
+    fit = person.fit and person.fit["percent"]
+    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, fit=fit, seconds=seconds, warnings=warnings)
 
 
 def refine_human(command: RefineCommand, session: Session, report: ReportProgress) -> None:
@@ -164,6 +168,13 @@ def split_cameras(count: int, held: int) -> tuple[list[int], list[int]]:
         raise ValueError(f"{held} of {count} cameras cannot be held out: choose 0 to {count - 1}")
     out = [int((place + 0.5) * count / held) for place in range(held)]
     return out, [camera for camera in range(count) if camera not in out]
+
+
+def _write_found(folder: Path, person: CapturedPerson) -> None:
+    """posture.json, and mask.png of a picture that had no mask."""
+    write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views, person.fit)
+    for mask in person.masks_made:
+        Image.fromarray(mask).save(folder / MASK_FILE)
 
 
 def _files(request: Pictures) -> tuple[Any, ...]:

@@ -13,6 +13,7 @@ from .schema import Open, Range
 
 Count = Annotated[int, Range(0)]
 Seconds = Annotated[float, Range(0, 2**63)]
+Percent = Annotated[int, Range(0, 100)]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,13 +55,16 @@ class ReconstructAnswer(HumanAnswer):
     seconds_encoding: Seconds | None = None
     posture: Path | None = None
     """posture.json: pose, shape and cameras in pictures; None for captures."""
+    fit: Percent | None = None
+    """How well the body in that posture explains the pictures; None for captures."""
 
     def __str__(self) -> str:
         """As the command line prints it."""
         seen = (
             "pictures" if self.subject is None else f"{self.subject}, frame {self.frame}, {len(self.views or ())} views"
         )
-        return f"{self.person.parent}  {seen}, {self.seconds:.1f} s"
+        fit = "" if self.fit is None else f", fit {self.fit} %"
+        return f"{self.person.parent}  {seen}{fit}, {self.seconds:.1f} s"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,6 +76,8 @@ class FitPostureAnswer(Open):
     seconds: Seconds
     warnings: list[str]
     """Sentences."""
+    fit: Percent | None = None
+    """How well the body in that posture explains the pictures."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

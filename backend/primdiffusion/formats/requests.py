@@ -249,7 +249,8 @@ class Pictures:
     pictures: Annotated[tuple[Path, ...], Option(positional=True)] = ()
     """PNG or JPEG files of one person, who is marked by alpha or by `masks`."""
     masks: tuple[Path, ...] = ()
-    """A mask for each picture, of its size: opaque or white where the person is; pictures with alpha need none."""
+    """A mask for each picture, of its size: opaque or white where the person is. Pictures with alpha need none,
+    nor does a single picture with a posture of its own camera, which cuts the person out (extra cutout) to mask.png."""
     mask_label: Annotated[int, Range(0, 65535)] | None = None
     """The person's label in masks of more than two: the index in their palette, or else the grey value."""
     pose: Path | None = None

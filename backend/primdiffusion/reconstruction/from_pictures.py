@@ -13,15 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.cut_out import load_opencv
+from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph, read_photographs
-from primdiffusion.capture.reader import Views
+from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.primitives.primitives import Payload
 from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
-from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
-from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error, resized
+from primdiffusion.reconstruction.posture_masks import cut_by_outline, outline_in, without_things
+from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
 from primdiffusion.reconstruction.posture_start import (
     STANDING_ARMS,
     before_cameras,
@@ -49,8 +54,8 @@ ROUNDS = (Round(96, Stage(60, 0.04, upright=False), 2), Round(96, Stage(80, 0.02
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
-LEAST_OVERLAP = 0.8
-"""Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
+OUTLINE_IN_PICTURE = 256
+"""Largest side of the drawing of a body over a picture without a mask, pixels."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -69,6 +74,14 @@ class Start:
     """See `PostureFit`."""
 
 
+class Found(NamedTuple):
+    """What a fit found in pictures."""
+
+    posture: Posture
+    photographs: Sequence[Photograph]
+    """The pictures, without the parts of their masks that are no person's."""
+
+
 def person_in_pictures(
     model: DiffusionModel,
     pictures: Sequence[str | Path],
@@ -83,7 +96,8 @@ def person_in_pictures(
     """The person in plain pictures, for `reconstruct`; the fields of `requests.Pictures` say what the files are.
 
     Pose, shape and cameras are refined from those of the files, or of a standing body; otherwise both files are needed.
-    `on_step` is called POSTURE_STEPS times while refining; an exception that it raises cancels. Deterministic.
+    A single picture that has neither alpha nor a mask is cut out by the outline of the body, if the pose file has its
+    camera. `on_step` is called POSTURE_STEPS times while refining; an exception that it raises cancels. Deterministic.
 
         >>> person = pd.person_in_pictures(model, ["anna.png"])
         >>> person.betas.shape
@@ -91,23 +105,29 @@ def person_in_pictures(
 
     Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
     """
-    photographs = read_photographs(list(map(Path, pictures)), list(map(Path, masks)), mask_label=mask_label)
-    known = (None if path is None else Path(path) for path in (pose, cameras))
+    known = [None if path is None else Path(path) for path in (pose, cameras)]
+    photographs = read_photographs(
+        list(map(Path, pictures)),
+        list(map(Path, masks)),
+        mask_label=mask_label,
+        outline=None if pose is None or len(pictures) > 1 else lambda *size: _body_in(model, *known, size),
+    )
     start, warnings = start_of(photographs, model, *known), []
-    posture = start.posture
     if refine:
-        posture = fit_posture_in(model, photographs, start, on_step)
+        found = fit_posture_in(model, photographs, start, on_step)
     elif not start.complete:
         raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
+    else:
+        targets = _targets(photographs, start.posture, ROUNDS[-1].side)
+        found = Found(start.posture, _cut_out(_mean_human(model), photographs, targets))
     if pose is None:
         warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
-    overlap = outline_overlap(model, photographs, posture)
-    if overlap < LEAST_OVERLAP:
-        warnings.append(
-            f"the fitted body and the masks overlap by {100 * overlap:.0f} %: the pose was probably not found; give a "
-            "pose file that is nearer"
-        )
-    return person_in(photographs, posture, warnings)
+    quality = fit_quality(model, photographs, found)
+    masks_made = tuple(one.whole_mask() for one in found.photographs if one.uncut is not None)
+    if masks_made:
+        warnings.append("the picture has no mask: the person was cut out by the outline of the body; look at mask.png")
+    person = person_in(found.photographs, found.posture, [*warnings, *quality.warnings()])
+    return dataclasses.replace(person, fit=quality.content(), masks_made=masks_made)
 
 
 def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Sequence[str] = ()) -> CapturedPerson:
@@ -158,28 +178,73 @@ def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: S
 
 def fit_posture_in(
     model: DiffusionModel, photographs: Sequence[Photograph], start: Start, on_step: Callable[[], None]
-) -> Posture:
-    """The posture in the pictures; deterministic.
+) -> Found:
+    """The posture in the pictures; deterministic. Things that no body explains are left out of the last round.
 
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
     components = PersonComponents.of(model)
     fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
-    for side, stage, coefficient_steps in ROUNDS:
+    for number, (side, stage, coefficient_steps) in enumerate(ROUNDS):
         payload = components.payload(components.coefficients(people))
-        fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)
+        targets = _targets(photographs, fit.posture(), side)
+        if number in (0, len(ROUNDS) - 1):
+            photographs = _cut_out(payload, photographs, targets)
+        if 0 < number == len(ROUNDS) - 1:
+            pairs = zip(photographs, targets, strict=True)
+            photographs = [
+                one if one.uncut is not None else without_things(payload, one, target) for one, target in pairs
+            ]
+        targets = _targets(photographs, fit.posture(), side)
+        fit.refine(payload, targets, stage, on_step)
         targets = _targets(photographs, fit.posture(), side)
         for _ in range(coefficient_steps):
             people = components.closer(people, targets)
             on_step()
-    return fit.posture()
+    return Found(fit.posture(), photographs)
 
 
-def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> float:
-    """Intersection over union of the mean human in the posture and the masks."""
+def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
+    """How well what was found explains the pictures. Raises ValueError as `PersonComponents.of`."""
+    pairs = zip(found.photographs, photographs, strict=True)
+    left_out = max(1 - _area(kept) / _area(one) if kept.uncut is None else 0.0 for kept, one in pairs)
+    targets = _targets(found.photographs, found.posture, ROUNDS[0].side)
+    return quality_of(PersonComponents.of(model), found.posture, targets, left_out)
+
+
+def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Sequence[PosedView]) -> list[Photograph]:
+    """The photographs; the persons of those without a mask are cut out again, by the human's outline."""
+    pairs = zip(photographs, targets, strict=True)
+    return [one if one.uncut is None else cut_by_outline(payload, one, target) for one, target in pairs]
+
+
+def _mean_human(model: DiffusionModel) -> Payload:
     components = PersonComponents.of(model)
-    targets = _targets(photographs, posture, ROUNDS[0].side)
-    return overlap_of(components.payload(components.coefficients(components.everyone())), targets)
+    return components.payload(components.coefficients(components.everyone()))
+
+
+def _body_in(
+    model: DiffusionModel, pose_path: Path, cameras_path: Path | None, size: tuple[int, int]
+) -> UInt8[np.ndarray, "H W"]:
+    """255 near the body of a posture in a picture of this width and height that has no mask."""
+    load_opencv()
+    known = read_posture(pose_path, [size])
+    views = known.views if cameras_path is None else read_cameras(cameras_path, [size])
+    if views is None:
+        raise ValueError(
+            "the picture has neither alpha nor a mask, and the pose no camera, so the person cannot be cut out: give "
+            "one of them"
+        )
+    camera, scale = as_camera(views[0]), min(1.0, OUTLINE_IN_PICTURE / max(size))
+    small = dataclasses.replace(camera, width=round(scale * size[0]), height=round(scale * size[1]))
+    betas = model.shapes.bias if known.betas is None else known.betas
+    posture = Posture(repeated(known.pose, 1), betas, stack([resized(camera, scale, small)]))
+    return outline_in(_mean_human(model), posture, size)
+
+
+def _area(photograph: Photograph) -> float:
+    """Of the person, in pixels; 1 where nobody is left."""
+    return max(1.0, photograph.rgba[..., 3].sum(dtype=np.float64) / 255)
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:

@@ -196,23 +196,11 @@ def _difference(
     return _blurred(_encoded(seen.rgb, seen.alpha[..., None]) - picture, blur).square().sum() / picture[3].sum()
 
 
+@torch.no_grad()
 def outline_error(payload: Payload, targets: Sequence[PosedView]) -> float:
     """Mean squared difference of opacity."""
-    drawn, masks = _outlines(payload, targets)
-    return float((drawn - masks).square().mean())
-
-
-def overlap(payload: Payload, targets: Sequence[PosedView]) -> float:
-    """Intersection over union of the human and the masks."""
-    drawn, masks = _outlines(payload, targets)
-    return float(torch.minimum(drawn, masks).sum() / torch.maximum(drawn, masks).sum())
-
-
-@torch.no_grad()
-def _outlines(payload: Payload, targets: Sequence[PosedView]) -> tuple[Float[Tensor, "v H W"], Float[Tensor, "v H W"]]:
-    """Opacity of the human, and that of the pictures."""
     drawn = [march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha for target in targets]
-    return torch.stack(drawn), torch.stack([target.rgba[..., 3] for target in targets])
+    return float((torch.stack(drawn) - torch.stack([target.rgba[..., 3] for target in targets])).square().mean())
 
 
 def _encoded(rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 H W"]:

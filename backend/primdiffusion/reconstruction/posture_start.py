@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -191,11 +191,18 @@ def read_cameras(path: Path, sizes: Sequence[tuple[int, int]]) -> list[View]:
     return _views(content.get("cameras", content) if isinstance(content, dict) else content, path, sizes)
 
 
-def write_posture(path: Path, pose: BodyPose, betas: Float[Tensor, "10"], views: Sequence[View]) -> None:
-    """Write a posture, whole or not at all. Raises OSError."""
+def write_posture(
+    path: Path,
+    pose: BodyPose,
+    betas: Float[Tensor, "10"],
+    views: Sequence[View],
+    fit: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a posture, and how well it explains its pictures, whole or not at all. Raises OSError."""
     theta = matrix_to_axis_angle(pose.joint_rotation).flatten(1)
     content = {
         "format": FORMAT,
+        **({} if fit is None else {"fit": dict(fit)}),
         "pose": _rounded(theta),
         "translation": _rounded(pose.translation),
         "betas": _rounded(betas),

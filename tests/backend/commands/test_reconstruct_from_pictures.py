@@ -63,9 +63,12 @@ def test_a_picture_becomes_a_human_and_its_posture(line, tmp_path, capsys):
     assert red > green
     posture = json.loads((out / "posture.json").read_text())
     assert posture["betas"] == pytest.approx(human.betas.tolist(), abs=1e-4)
-    warnings = capsys.readouterr().err
-    assert "only one picture" in warnings
-    assert "no pose was given" in warnings
+    printed = capsys.readouterr()
+    assert "only one picture" in printed.err
+    assert "no pose was given" in printed.err
+    percent = posture["fit"]["percent"]
+    assert f", fit {percent} %, " in printed.out
+    assert (f"the fit is {percent} %" in printed.err) == (percent < 85)
 
 
 def test_the_posture_can_be_used_again_without_refining(line, tmp_path):
@@ -76,6 +79,21 @@ def test_the_posture_can_be_used_again_without_refining(line, tmp_path):
     for key in ("pose", "translation", "betas"):
         assert np.allclose(before[key], after[key], atol=2e-5)
     assert np.allclose(before["cameras"]["camera0000"]["K"], after["cameras"]["camera0000"]["K"], atol=0.05)
+
+
+def test_a_photograph_without_a_mask_is_cut_out_by_the_body_posed_over_it(line, picture, tmp_path, capsys):
+    pytest.importorskip("cv2")
+    cli.main(line)
+    posture = shutil.copy(tmp_path / "out" / "posture.json", tmp_path / "posture.json")
+    cut = Image.open(picture)
+    plain = Image.new("RGB", cut.size, (40, 160, 60))
+    plain.paste(cut, mask=cut)
+    plain.save(tmp_path / "plain.png")
+    cli.main(["reconstruct", str(tmp_path / "plain.png"), *line[2:], "--pose", str(posture)])
+    assert "look at mask.png" in capsys.readouterr().err
+    mask, true = np.asarray(Image.open(tmp_path / "out" / "mask.png")) > 127, np.asarray(cut)[..., 3] > 127
+    assert mask.shape == true.shape
+    assert (mask & true).sum() / (mask | true).sum() > 0.9
 
 
 def test_seeds_vary_the_human_and_repeat(line, tmp_path):
@@ -103,7 +121,7 @@ def test_a_fit_alone_writes_the_posture_and_can_be_cancelled_at_every_report(pic
     reports = []
     answer = fit_posture(request, Session(), lambda *report: reports.append(report[:3]))
     assert answer.posture == tmp_path / "out" / "posture.json"
-    assert answer.posture.is_file()
+    assert answer.fit == json.loads(answer.posture.read_text())["fit"]["percent"]
     assert not any("sides" in warning for warning in answer.warnings)  # a fit makes none
     assert [report[0] for report in reports[:2]] == ["load", "read"]
     ended_at_each_report(lambda report: fit_posture(request, Session(), report), tmp_path / "out")

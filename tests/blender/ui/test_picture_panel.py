@@ -123,7 +123,7 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
     assert moved == pytest.approx(translation + MOVED, abs=1e-5)
     assert np.array(betas_of(person)) == pytest.approx(betas + np.eye(10)[1] * 0.5, abs=1e-6)
     assert focal_length(chosen) == pytest.approx(1.1 * focal, rel=1e-4)
-    assert notice_of("fit_picture").startswith("Fitted in ")
+    assert notice_of("fit_picture").startswith("Fitted (fit 92 %) in ")
     assert "A guess." in notice_of("fit_picture")
     assert len(humans(chosen.scene)) == 1
     bpy.ops.ed.undo()

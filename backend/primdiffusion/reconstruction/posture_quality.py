@@ -1,0 +1,199 @@
+"""How well a fitted human explains its pictures: one number, and what to do about a bad one.
+
+The human is drawn in its posture, with the colours that explain the pictures best. What counts is how far outlines and
+colours differ, whether limbs lie within the mask and hands are where they were put, and whether knees and elbows bend
+as they can.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry.rotation import matrix_to_axis_angle
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.reconstruction.from_captures import PersonComponents
+from primdiffusion.reconstruction.posture_fit import COARSE, Posture, each
+from primdiffusion.reconstruction.posture_masks import grown, unexplained
+from primdiffusion.render.image import PosedView
+from primdiffusion.render.march import march
+
+LEAST_PERCENT = 85
+"""A fit below has probably failed; one of `LIMITS` is reached."""
+LIMITS: Mapping[str, float] = {
+    "outline": 0.03,
+    "colour": 0.08,
+    "unexplained": 0.03,
+    "left_out": 0.1,
+    "outside": 0.28,
+    "hand": 0.115,
+    "joint": 1.0,
+}
+"""Values that fits of whole people in good masks stay below (`benchmarks/plain_pictures.py --spoiled`)."""
+COLOUR_STEPS = 2
+"""Gauss-Newton steps to the person coefficients that draw the colours."""
+EDGE_PX = 1
+"""Difference of outlines that does not count, pixels of the small pictures that are compared."""
+PATTERN_PX = 7
+"""Side of the squares over which colours are compared, in the same pixels: patterns cannot be drawn."""
+KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
+"""How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
+LIMBS: Mapping[str, tuple[str, ...]] = {
+    f"{side} {limb}": tuple(f"{side}_{joint}" for joint in joints)
+    for side in ("left", "right")
+    for limb, joints in {
+        "hand": ("wrist", "hand"),
+        "forearm": ("elbow", "wrist", "hand"),
+        "lower leg": ("knee", "ankle", "foot"),
+    }.items()
+}
+"""Ends of limbs, by the joints that move them."""
+
+
+class FitQuality(NamedTuple):
+    """How well a human explains one picture; each value is 0 at best, and `LIMITS` has the largest of good fits."""
+
+    outline: float
+    """1 - intersection over union of the outlines, but for their edges."""
+    colour: float
+    """Difference of encoded colour, means over small squares, that nine tenths of the pixels do not exceed."""
+    unexplained: float
+    """Share of the mask that is no part of the human, even with wide clothes."""
+    left_out: float
+    """Share of the mask that was left out of the fit."""
+    outside: float
+    """Share of a limb outside of the mask, the largest."""
+    hand: float
+    """Mean difference of encoded colour at a hand, the largest."""
+    joint: float
+    """Angle of a knee or an elbow, by how far it can bend in that direction, the largest."""
+    limb: str
+    """The limb outside of the mask."""
+
+    @property
+    def worst(self) -> str:
+        """The value that is largest by its limit."""
+        return max(LIMITS, key=lambda name: getattr(self, name) / LIMITS[name])
+
+    @property
+    def percent(self) -> int:
+        """100 of a picture that is explained in full, LEAST_PERCENT where one value reaches its limit."""
+        share = getattr(self, self.worst) / LIMITS[self.worst]
+        return max(0, math.floor(100 - (100 - LEAST_PERCENT) * share))
+
+    def content(self) -> dict[str, Any]:
+        """As posture.json holds it."""
+        values = {name: round(getattr(self, name), 4) for name in LIMITS}
+        return {"percent": self.percent, "worst": self.worst, **values}
+
+    def warnings(self) -> list[str]:
+        """What to do, in a sentence, about a fit below LEAST_PERCENT, and about what was left out."""
+        warnings = []
+        if self.left_out:
+            warnings.append(
+                f"{100 * self.left_out:.0f} % of the mask belongs to no body (a bag, a chair?) and was left out: if it "
+                "is a limb, pose a human over the picture and fit again"
+            )
+        if self.percent < LEAST_PERCENT:
+            what = {
+                "outline": "the outlines of the body and of the mask differ",
+                "colour": "colours within the mask are not those of a person seen from the front",
+                "unexplained": f"{100 * self.unexplained:.0f} % of the mask belongs to no body",
+                "left_out": "too much of the mask was left out",
+                "outside": f"the {self.limb} lies outside of the mask",
+                "hand": "a hand is not where the body has it: it is hidden, cut off, or seen from behind",
+                "joint": "a knee or an elbow bends as it cannot",
+            }[self.worst]
+            warnings.append(
+                f"the fit is {self.percent} %: {what}; pose a human over the picture by hand, or mask what is not the "
+                "person"
+            )
+        return warnings
+
+
+def quality_of(
+    components: PersonComponents, posture: Posture, targets: Sequence[PosedView], left_out: float = 0.0
+) -> FitQuality:
+    """How well a posture explains its pictures: of several, the one that it explains worst.
+
+    `targets` are small pictures by the posture's own cameras and boxes; `left_out` a share of their masks before.
+    """
+    people = components.everyone()
+    for _ in range(COLOUR_STEPS):
+        people = components.closer(people, targets)
+    payload = components.payload(components.coefficients(people))
+    pairs = zip(each(posture.pose), targets, strict=True)
+    return min((_quality(payload, pose, target, left_out) for pose, target in pairs), key=lambda one: one.percent)
+
+
+@torch.no_grad()
+def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: float) -> FitQuality:
+    seen, opacity = march(Primitives.place(target.frames, payload), target.camera, COARSE), target.rgba[..., 3]
+    mask, drawn = opacity > 0.5, seen.alpha > 0.5
+    wrong = (mask & ~grown(drawn, EDGE_PX)) | (drawn & ~grown(mask, EDGE_PX))
+    difference = encode_srgb(seen.rgb.clamp(1e-4, 1)) - encode_srgb(target.rgba[..., :3].clamp(1e-4, 1))
+    differs, inner = difference.abs().mean(-1), (opacity > 0.9) & (seen.alpha > 0.9)
+    inside = _mean_around(difference, inner).abs().mean(-1)[inner]
+    outside, hand = {}, 0.0
+    for limb, share in _limbs_drawn(payload, target).items():
+        within = share * mask
+        outside[limb] = 1 - float(within.sum() / share.sum().clamp_min(1e-6)) if share.sum() else 0.0
+        if limb.endswith("hand"):
+            hand = max(hand, float((within * differs).sum() / within.sum().clamp_min(1e-6)))
+            del outside[limb]  # a part of the forearm
+    limb = max(outside, key=lambda name: outside[name])
+    return FitQuality(
+        outline=float(wrong.sum() / (mask | drawn).sum()),
+        colour=float(inside.quantile(0.9)) if len(inside) else 1.0,
+        unexplained=float(unexplained(seen.alpha, opacity).sum() / mask.sum()),
+        left_out=left_out,
+        outside=outside[limb],
+        hand=hand,
+        joint=_strain(pose),
+        limb=limb,
+    )
+
+
+def _mean_around(values: Float[Tensor, "H W 3"], inner: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+    """Means over the pixels of the figure in squares, in which stripes and checks are one colour."""
+    weights = torch.cat([values * inner[..., None], inner[..., None].float()], -1).movedim(-1, 0)[None]
+    sums = torch.nn.functional.avg_pool2d(weights, PATTERN_PX, stride=1, padding=PATTERN_PX // 2)[0]
+    return (sums[:3] / sums[3:].clamp_min(1e-6)).movedim(0, -1)
+
+
+def _limbs_drawn(payload: Payload, target: PosedView) -> dict[str, Float[Tensor, "H W"]]:
+    """What the boxes of each limb contribute to the pixels."""
+    limbs, drawn = list(LIMBS), []
+    for first in range(0, len(limbs), 3):
+        marked = torch.zeros_like(payload.rgb)
+        for channel, limb in enumerate(limbs[first : first + 3]):
+            joints = [JOINT_NAMES.index(name) for name in LIMBS[limb]]
+            marked[torch.isin(_joint_of_boxes(), torch.tensor(joints)), channel] = 1
+        boxes = Primitives.place(target.frames, dataclasses.replace(payload, rgb=marked))
+        drawn += march(boxes, target.camera, COARSE).rgb.unbind(-1)
+    return dict(zip(limbs, drawn, strict=True))
+
+
+@functools.cache
+def _joint_of_boxes() -> Tensor:
+    return anchor_skin_weights(default_anchors(), default_body()).argmax(-1)
+
+
+def _strain(pose: BodyPose) -> float:
+    turn, strain = matrix_to_axis_angle(pose.joint_rotation), [0.0]
+    for side, backward in (("left", 1.0), ("right", -1.0)):
+        knee, elbow = (turn[JOINT_NAMES.index(f"{side}_{name}")] for name in ("knee", "elbow"))
+        strain.append(max(-float(knee[0]), float(knee[1:].norm())) / math.radians(KNEE_DEGREES))
+        strain.append(backward * float(elbow[1]) / math.radians(ELBOW_DEGREES))
+    return max(strain)

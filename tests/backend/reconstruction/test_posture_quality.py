@@ -1,0 +1,139 @@
+"""Fits say how good they are: pictures of the tiny model's human, whole and spoiled."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.capture.photograph import Photograph
+from primdiffusion.capture.reader import Window
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import framing
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.reconstruction.from_captures import PersonComponents
+from primdiffusion.reconstruction.from_pictures import Found, fit_quality
+from primdiffusion.reconstruction.posture_fit import Posture
+from primdiffusion.reconstruction.posture_masks import without_things
+from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, FitQuality
+from primdiffusion.reconstruction.posture_start import standing
+from primdiffusion.render.image import PosedView
+from primdiffusion.render.march import march
+from tiny_model import tiny_model
+
+MODEL, SIDE = tiny_model(), 96
+COMPONENTS = PersonComponents.of(MODEL)
+PAYLOAD = COMPONENTS.payload(COMPONENTS.coefficients(COMPONENTS.everyone()))
+NONE = FitQuality(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "left forearm")
+
+
+def a_posture() -> Posture:
+    pose, betas = standing(1, 50.0), torch.zeros(10)
+    (frames,) = Posture(pose, betas, None).frames()
+    camera = framing(Primitives.place(frames, PAYLOAD), 0.0, SIDE, SIDE)
+    return Posture(pose, betas, camera.map(lambda values: values[None]))
+
+
+POSTURE = a_posture()
+
+
+def seen(posture: Posture = POSTURE) -> tuple[Photograph, PosedView]:
+    """The human's picture, 8-bit and linear."""
+    (frames,), camera = posture.frames(), posture.camera.map(lambda values: values[0])
+    with torch.no_grad():
+        picture = march(Primitives.place(frames, PAYLOAD), camera)
+    rgba = torch.cat([encode_srgb(picture.rgb.clamp(0, 1)), picture.alpha[..., None]], -1)
+    pixels = (255 * rgba).round().to(torch.uint8).numpy()
+    photograph = Photograph(Path("anna.png"), pixels, Window(0, 0, SIDE, SIDE), SIDE, SIDE, None)
+    return photograph, PosedView(frames, camera, torch.cat([picture.rgb, picture.alpha[..., None]], -1))
+
+
+def with_ball() -> tuple[Photograph, np.ndarray]:
+    """The picture with a ball at one side of the legs, and where the ball is."""
+    photograph, _ = seen()
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    ball = (rows - 0.8 * SIDE) ** 2 + (columns - 0.8 * SIDE) ** 2 < (0.1 * SIDE) ** 2
+    rgba = photograph.rgba.copy()
+    rgba[ball] = (200, 30, 30, 255)
+    return dataclasses.replace(photograph, rgba=rgba), ball
+
+
+def quality(photograph: Photograph, posture: Posture = POSTURE, kept: Photograph | None = None) -> FitQuality:
+    return fit_quality(MODEL, [photograph], Found(posture, [photograph if kept is None else kept]))
+
+
+def test_a_whole_human_in_its_own_posture_fits_and_says_nothing():
+    found = quality(seen()[0])
+    assert found.percent > LEAST_PERCENT
+    assert found.warnings() == []
+    assert found.content()["percent"] == found.percent
+    assert set(found.content()) == {"percent", "worst", *LIMITS}
+
+
+def test_a_ball_is_left_out_whole_and_the_human_is_kept():
+    photograph, ball = with_ball()
+    _, target = seen()
+    rgba = torch.from_numpy(photograph.rgba.astype(np.float32) / 255)
+    kept = without_things(PAYLOAD, photograph, dataclasses.replace(target, rgba=rgba))
+    body = target.rgba[..., 3].numpy() > 0.5
+    assert not kept.rgba[ball & ~body].any()
+    assert np.array_equal(kept.rgba[body], photograph.rgba[body])
+    found = quality(photograph, kept=kept)
+    assert found.left_out == pytest.approx((ball & ~body).sum() / (ball | body).sum(), abs=0.02)
+    assert "belongs to no body" in found.warnings()[0]
+
+
+def test_parts_are_left_out_of_the_large_picture_where_they_are_in_the_small_one():
+    photograph, _ = with_ball()
+    _, target = seen()
+    rgba = torch.from_numpy(photograph.rgba.astype(np.float32) / 255)
+    large = np.pad(photograph.rgba.repeat(6, 0).repeat(6, 1), [(0, 2), (0, 2), (0, 0)])  # 96 x 6 + 2 pixels
+    kept = without_things(PAYLOAD, dataclasses.replace(photograph, rgba=large), dataclasses.replace(target, rgba=rgba))
+    same = without_things(PAYLOAD, photograph, dataclasses.replace(target, rgba=rgba))
+    assert np.array_equal(kept.rgba[: 6 * SIDE : 6, : 6 * SIDE : 6], same.rgba)
+
+
+def test_what_is_explained_is_left_as_it_is():
+    photograph, target = seen()
+    assert without_things(PAYLOAD, photograph, target) is photograph
+
+
+def test_a_ball_that_is_still_there_is_a_failed_fit():
+    found = quality(with_ball()[0])
+    assert found.percent < LEAST_PERCENT
+    assert "pose a human over the picture by hand, or mask" in found.warnings()[-1]
+
+
+def test_a_leg_that_the_mask_lacks_is_a_failed_fit_that_names_it():
+    photograph, _ = seen()
+    rgba = photograph.rgba.copy()
+    rgba[int(0.7 * SIDE) :, SIDE // 2 :] = 0  # the person's left, seen from the front
+    found = quality(dataclasses.replace(photograph, rgba=rgba))
+    assert found.percent < LEAST_PERCENT
+    assert found.outside > 0.9
+    assert found.limb == "left lower leg"
+
+
+@pytest.mark.parametrize(
+    ("joint", "turn"), [("left_knee", (0, 0, 40)), ("right_knee", (-40, 0, 0)), ("left_elbow", (0, 90, 0))]
+)
+def test_joints_that_bend_as_they_cannot_are_a_failed_fit(joint, turn):
+    rotation = POSTURE.pose.joint_rotation.clone()
+    rotation[0, JOINT_NAMES.index(joint)] = axis_angle_to_matrix(torch.tensor(turn) * math.pi / 180)
+    bent = dataclasses.replace(POSTURE, pose=dataclasses.replace(POSTURE.pose, joint_rotation=rotation))
+    found = quality(seen(bent)[0], bent)
+    assert found.joint > 1
+    assert found.percent < LEAST_PERCENT
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_each_value_at_its_limit_is_the_least_good_fit(name):
+    at, above = (NONE._replace(**{name: factor * LIMITS[name]}) for factor in (1 - 1e-6, 1.01))
+    assert at.percent == LEAST_PERCENT
+    assert above.percent < LEAST_PERCENT
+    assert above.worst == name
+    assert len(above.warnings()) == 1 + (name == "left_out")
+    assert NONE._replace(**{name: 1e3}).percent == 0
