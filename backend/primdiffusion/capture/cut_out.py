@@ -6,7 +6,7 @@ from the optional extra `primdiffusion[cutout]`.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -38,8 +38,8 @@ def cut_out(pixels: UInt8[np.ndarray, "H W 3"], outline: Bool[np.ndarray, "H W"]
     height = int(outline.any(1).sum())
     if not height:
         return np.zeros(outline.shape, np.uint8)
-    inside = ndimage.distance_transform_edt(np.pad(outline, 1))[1:-1, 1:-1] > INNER * height
-    near = ndimage.distance_transform_edt(~outline) <= OUTER * height
+    inside = np.asarray(ndimage.distance_transform_edt(np.pad(outline, 1)))[1:-1, 1:-1] > INNER * height
+    near = np.asarray(ndimage.distance_transform_edt(~outline)) <= OUTER * height
     state = np.where(near, cv2.GC_PR_BGD, cv2.GC_BGD)
     state[outline] = cv2.GC_PR_FGD
     state[inside] = cv2.GC_FGD
@@ -49,6 +49,6 @@ def cut_out(pixels: UInt8[np.ndarray, "H W 3"], outline: Bool[np.ndarray, "H W"]
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(colours, state, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
     found = (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)
-    found = ndimage.binary_opening(found, np.ones((2, 2))) | inside  # edges of things behind are hair-thin
-    parts, _ = ndimage.label(found)
+    found = np.asarray(ndimage.binary_opening(found, np.ones((2, 2))), bool) | inside  # edges of things behind are hair-thin
+    parts, _ = cast("tuple[np.ndarray, int]", ndimage.label(found))
     return np.where(found & np.isin(parts, np.unique(parts[inside])), np.uint8(255), np.uint8(0))

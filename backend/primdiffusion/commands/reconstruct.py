@@ -81,7 +81,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         **of_capture,
         frame=person.frame,
         posture=None if request.capture else request.out_dir / POSTURE_FILE,
-        fit=person.fit and person.fit["percent"],
+        fit=None if person.fit is None else person.fit["percent"],
         seed=request.seed,
         warnings=[*warnings, *person.warnings],
         seconds=round(time.perf_counter() - began, 3),
@@ -100,7 +100,7 @@ def fit_posture(request: FitPostureRequest, session: Session, report: ReportProg
         person = person_in_pictures(model, *_files(request), on_step=_steps(report, POSTURE_STEPS))
         _write_found(folder, person)
     seconds, warnings = round(time.perf_counter() - began, 3), list(person.warnings)
-    fit = person.fit and person.fit["percent"]
+    fit = None if person.fit is None else person.fit["percent"]
     return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, fit=fit, seconds=seconds, warnings=warnings)
 
 

@@ -105,14 +105,14 @@ def person_in_pictures(
 
     Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
     """
-    known = [None if path is None else Path(path) for path in (pose, cameras)]
+    pose, cameras = (None if path is None else Path(path) for path in (pose, cameras))
     photographs = read_photographs(
         list(map(Path, pictures)),
         list(map(Path, masks)),
         mask_label=mask_label,
-        outline=None if pose is None or len(pictures) > 1 else lambda *size: _body_in(model, *known, size),
+        outline=None if pose is None or len(pictures) > 1 else lambda *size: _body_in(model, pose, cameras, size),
     )
-    start, warnings = start_of(photographs, model, *known), []
+    start, warnings = start_of(photographs, model, pose, cameras), []
     if refine:
         found = fit_posture_in(model, photographs, start, on_step)
     elif not start.complete:

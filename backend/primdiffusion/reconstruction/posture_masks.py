@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import cast
 
 import numpy as np
 import torch
@@ -26,14 +27,15 @@ LEAST_PART = 0.012
 
 def grown(mask: Bool[Tensor, "H W"], reach: float) -> Bool[Tensor, "H W"]:
     """All pixels within `reach` of a mask."""
-    return torch.from_numpy(ndimage.distance_transform_edt(~mask.numpy()) <= reach) if mask.any() else mask
+    return torch.from_numpy(np.asarray(ndimage.distance_transform_edt(~mask.numpy())) <= reach) if mask.any() else mask
 
 
 def unexplained(drawn: Float[Tensor, "H W"], opacity: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """Parts of a mask, each of some size, that lie farther from the human drawn than wide clothes do."""
     mask = opacity > 0.5
     beyond = mask & ~grown(drawn > 0.5, CLOTHES * int(mask.any(1).sum()))
-    labels, count = ndimage.label(ndimage.binary_opening(beyond.numpy(), np.ones((2, 2))))
+    opened = ndimage.binary_opening(beyond.numpy(), np.ones((2, 2)))
+    labels, count = cast("tuple[np.ndarray, int]", ndimage.label(opened))
     large = [number for number in range(1, count + 1) if (labels == number).sum() > LEAST_PART * int(mask.sum())]
     return torch.from_numpy(np.isin(labels, large))
 
