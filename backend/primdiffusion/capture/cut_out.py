@@ -49,6 +49,6 @@ def cut_out(pixels: UInt8[np.ndarray, "H W 3"], outline: Bool[np.ndarray, "H W"]
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(colours, state, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
     found = (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)
-    found = np.asarray(ndimage.binary_opening(found, np.ones((2, 2))), bool) | inside  # edges of things behind are hair-thin
+    found = np.asarray(ndimage.binary_opening(found, np.ones((2, 2))), bool) | inside  # edges behind are hair-thin
     parts, _ = cast("tuple[np.ndarray, int]", ndimage.label(found))
     return np.where(found & np.isin(parts, np.unique(parts[inside])), np.uint8(255), np.uint8(0))
