@@ -110,7 +110,7 @@ def test_the_installed_zip_generates_and_renders_a_human_and_blender_exits(archi
     assert (report["splats"] > 50_000) == SPLATS_AVAILABLE
     assert report["bones"] == 24
     assert report["backend_in_zip"]
-    assert report["written_into_the_addon"] == []
+    assert report["kernels_in_the_addon"] == []
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     red, green, blue, alpha = pixels(picture).transpose(2, 0, 1)
     assert alpha[0, 0] == 0.0

@@ -183,7 +183,7 @@ def test_a_script_gives_betas_and_measures(person):
         ops.reshape(betas=[9.0] * 10)
 
 
-def test_the_panels_show_height_provenance_and_counts(person, addon):
+def test_the_panels_show_height_and_provenance(person, addon):
     person[MARK] = json.dumps(
         {
             **json.loads(person[MARK]),
@@ -198,7 +198,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
     assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
-    for text in (*made, "Volumes: up to"):
+    for text in made:
         assert text in details
 
 
