@@ -43,7 +43,6 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
 
     scene_human = import_module(f"{MODULE}.scene.human")
     armature = scene_human.humans(bpy.context.scene)[0]
-    spent = import_module(f"{MODULE}.jobs.queue").queue.last.seconds
     rotations = walk_and_wave(arguments.frames)
     start = time.perf_counter()
     import_module(f"{MODULE}.scene.armature").keyframe_poses(
@@ -52,15 +51,13 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     keyframed = time.perf_counter() - start
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, arguments.frames
 
-    shutil.copyfile(import_module(f"{MODULE}.scene.payload").session_file(armature), arguments.human)
+    shutil.copyfile(scene_human.session_file(armature), arguments.human)
     numbers = [1, 1 + arguments.frames // 3, arguments.shown + 1, arguments.frames]
     np.savez(arguments.skinned, frames=numbers, vertices=np.stack([skinned(armature, number) for number in numbers]))
     bpy.context.scene.frame_set(arguments.shown + 1)
     bpy.ops.wm.save_as_mainfile(filepath=str(arguments.blend))
     return {
         "seconds_pressed_to_standing": pressed,
-        "seconds_generate": spent["work"],
-        "seconds_build_scene": spent["finish"],
         "seconds_keyframes": keyframed,
     }
 
