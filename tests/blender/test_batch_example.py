@@ -36,7 +36,7 @@ def words(out: Path, **more: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("motion", [None, "still.npy"])
+@pytest.mark.parametrize("motion", [pytest.param(None, marks=pytest.mark.any_blender), "still.npy"])
 def test_it_generates_poses_moves_renders_and_saves(addon, tmp_path, example, motion):
     np.save(tmp_path / "still.npy", np.zeros((3, 72)))
     more = {"motion": str(tmp_path / motion)} if motion else {}
@@ -52,6 +52,7 @@ def test_it_generates_poses_moves_renders_and_saves(addon, tmp_path, example, mo
     assert second.location.x == pytest.approx(0.6)
 
 
+@pytest.mark.any_blender
 def test_a_failure_of_an_operator_ends_it(addon, tmp_path, example):
     with refused(RuntimeError, "checkpoint"):
         example.main([*words(tmp_path / "out"), "--seeds", "7", str(FAILS)])

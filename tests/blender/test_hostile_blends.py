@@ -117,6 +117,7 @@ def test_a_damaged_or_foreign_packed_file_shows_the_body_and_is_told_once(pristi
     assert pristine.before() == before
 
 
+@pytest.mark.any_blender
 def test_a_packed_file_above_the_limit_is_not_read(pristine, monkeypatch):
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     monkeypatch.setattr(human, "LARGEST_PERSON", 1000)
@@ -148,6 +149,7 @@ def beside(pristine):
 RELATIVE = ["//python", "python", "./python", "../project/python", "//../project/python", r"\\host\share\python"]
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("named", RELATIVE)
 def test_a_python_beside_the_file_is_not_run_and_the_preferences_say_why(beside, named, monkeypatch):
     stage, preferences = beside
@@ -163,6 +165,7 @@ def test_a_python_beside_the_file_is_not_run_and_the_preferences_say_why(beside,
     assert "depends on the file that is open" in found.line
 
 
+@pytest.mark.any_blender
 def test_a_python_with_its_whole_path_is_taken(beside):
     _, preferences = beside
     preferences.backend_python = "/opt/python"
@@ -171,6 +174,7 @@ def test_a_python_with_its_whole_path_is_taken(beside):
     ]
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("name", ["checkpoint", "encoder"])
 def test_a_model_beside_the_file_is_not_taken(beside, name):
     _, preferences = beside

@@ -17,6 +17,8 @@ from scene_state import state
 from blender_primdiffusion.jobs.follow import Session
 from blender_primdiffusion.scene.build import build_human
 
+pytestmark = pytest.mark.any_blender
+
 LONGEST_SENTENCE = 300
 READS = {
     "import_motion": ("filepath", (".npz", ".npy", ".json", ".bvh", ".fbx")),

@@ -99,6 +99,7 @@ def test_our_own_people_are_posed_exactly(tmp_path, empty_scene):
         assert distance_m(scan, vertices).max() < 5e-5
 
 
+@pytest.mark.any_blender
 def test_removing_a_scan_leaves_nothing_and_keeps_what_was_there(tmp_path, empty_scene):
     path = own_person(tmp_path / "p.glb")
     kept = bpy.data.objects.new("kept", bpy.data.meshes.new("kept"))
@@ -146,6 +147,7 @@ def test_a_lamp_and_a_mesh_that_nothing_moves_are_left_out_and_reported(tmp_path
     assert not any(obj.type == "LIGHT" for obj in bpy.data.objects)
 
 
+@pytest.mark.any_blender
 def test_unknown_bones_are_named(tmp_path, empty_scene):
     names = {name: f"Bone.{number:03d}" for number, name in enumerate(JOINT_NAMES)}
     scan_fixtures.person(BODY, BETAS, None, names)
@@ -156,6 +158,7 @@ def test_unknown_bones_are_named(tmp_path, empty_scene):
     assert len(bpy.data.objects) == 0
 
 
+@pytest.mark.any_blender
 def test_a_size_that_no_unit_explains_is_named(tmp_path, empty_scene):
     _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan_fixtures.move([armature], np.diag([0.2, 0.2, 0.2, 1]))
@@ -191,6 +194,7 @@ def test_a_damaged_file_is_named_and_leaves_nothing(tmp_path, empty_scene, endin
     assert len(bpy.data.objects) == 0
 
 
+@pytest.mark.any_blender
 def test_a_skeleton_without_a_surface_is_named(tmp_path, empty_scene):
     mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     bpy.data.objects.remove(mesh)
@@ -198,6 +202,7 @@ def test_a_skeleton_without_a_surface_is_named(tmp_path, empty_scene):
         load(scan_fixtures.save(tmp_path / "bones.fbx"))
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("rig", sorted(set(RIGS) - {"Daz", "MocapNET", "Biovision"}))
 def test_every_rigs_own_names_are_known_with_any_prefix(rig):
     bones = [
@@ -210,6 +215,7 @@ def test_every_rigs_own_names_are_known_with_any_prefix(rig):
     assert len(found.joints) >= 22
 
 
+@pytest.mark.any_blender
 def test_names_that_are_no_rigs_are_rejected():
     with refused(ValueError, "pelvis"):
         map_bones(["a", "b"])
@@ -217,6 +223,7 @@ def test_names_that_are_no_rigs_are_rejected():
         map_bones([name for name in JOINT_NAMES if name != "left_knee"])
 
 
+@pytest.mark.any_blender
 def test_a_lost_vertex_is_named(tmp_path, empty_scene):
     mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     mesh.data.vertices[0].co.x = 1e6
@@ -224,6 +231,7 @@ def test_a_lost_vertex_is_named(tmp_path, empty_scene):
         load(scan_fixtures.save(tmp_path / "anna.glb"))
 
 
+@pytest.mark.any_blender
 def test_an_importers_failure_is_reported_by_its_exception_not_its_place(tmp_path, empty_scene):
     (tmp_path / "anna.glb").write_bytes(glb_of({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [7]}]}))
     with refused(FileError):

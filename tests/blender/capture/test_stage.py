@@ -85,7 +85,7 @@ def cast(person: PaintedPerson, view: View) -> tuple[np.ndarray, np.ndarray]:
     return nearest.reshape(view.height, view.width), faces.reshape(view.height, view.width)
 
 
-@pytest.mark.parametrize("which", ["rig", "odd"])
+@pytest.mark.parametrize("which", [pytest.param("rig", marks=pytest.mark.any_blender), "odd"])
 def test_depth_is_what_rays_through_the_centres_of_pixels_meet(stage, which):
     person = put(stage)
     view = Rig(count=3, width=SIZE, height=SIZE).views(np.zeros(3), 1.1)[2] if which == "rig" else odd_view()
@@ -117,7 +117,7 @@ def test_parts_and_normals_are_those_of_the_faces_that_are_met(stage):
     assert np.allclose(np.linalg.norm(centres.normal[met], axis=-1), 1, atol=1e-3)
 
 
-@pytest.mark.parametrize("which", ["rig", "odd"])
+@pytest.mark.parametrize("which", [pytest.param("rig", marks=pytest.mark.any_blender), "odd"])
 def test_a_marker_at_a_vertex_is_drawn_where_the_camera_puts_it(stage, which):
     view = Rig(count=3, width=SIZE, height=SIZE).views(np.zeros(3), 1.1)[1] if which == "rig" else odd_view()
     person = put(stage)
@@ -134,6 +134,7 @@ def test_a_marker_at_a_vertex_is_drawn_where_the_camera_puts_it(stage, which):
     assert np.abs((column + 0.5, row + 0.5) - expected).max() < 0.1
 
 
+@pytest.mark.any_blender
 def test_joints_are_where_spheres_at_them_are_drawn(stage):
     view = Rig(count=1, width=256, height=256).views(np.zeros(3), 1.1)[0]
     person = put(stage)
@@ -230,6 +231,7 @@ def test_a_users_camera_and_ours_see_the_same(empty_scene):
     assert np.allclose(view.project(point)[0], (x * 80, (1 - y) * 50), atol=1e-3)
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("own", "parents"),
     [((-1, -1, -1), (1, 1, 1)), ((-1, 1, 1), (1, 1, 1)), ((1, 1, 1), (1, 1, 3)), ((0, 1, 1), (1, 1, 1))],
@@ -282,6 +284,7 @@ def read_by_blender(path) -> np.ndarray:
     return found
 
 
+@pytest.mark.any_blender
 def test_float_depth_in_files_is_what_rays_meet(stage, tmp_path):
     person, view = put(stage), odd_view()
     write_passes(tmp_path, ("depth", "depth_float"), (0, 0), None, shoot_centres(stage, view, seed=5))
@@ -295,6 +298,7 @@ def test_float_depth_in_files_is_what_rays_meet(stage, tmp_path):
     assert np.abs(metres - steps * DEPTH_UNIT).max() <= DEPTH_UNIT / 2 + 1e-6
 
 
+@pytest.mark.any_blender
 def test_float_depth_is_a_pass_that_is_asked_for(empty_scene, tmp_path):
     rig = Rig(count=1, width=SIZE, height=SIZE)
     assert "depth_float" not in CaptureSettings(tmp_path, rig=rig).about(1)["passes"]
@@ -350,6 +354,7 @@ def test_hdris_of_a_folder_light_views_by_their_seeds_and_are_behind_people(empt
     assert again.read_bytes() == content
 
 
+@pytest.mark.any_blender
 def test_a_background_of_hdris_needs_them(tmp_path):
     with refused(ValueError, "hdri"):
         CaptureSettings(tmp_path, background="hdri")
@@ -358,6 +363,7 @@ def test_a_background_of_hdris_needs_them(tmp_path):
     assert "hdris" not in CaptureSettings(tmp_path, light="hdri", hdri=tmp_path / "a.hdr").about(1)
 
 
+@pytest.mark.any_blender
 def test_colours_are_encoded_as_srgb():
     assert srgb_bytes(np.array([0.0, 0.002, 0.2140411, 1.0, 3.0, -1.0])).tolist() == [0, 7, 127, 255, 255, 0]
 
@@ -399,6 +405,7 @@ def written(path: Path, content: bytes) -> Path:
     return path
 
 
+@pytest.mark.any_blender
 def test_nan_is_black(tmp_path):
     path = written(tmp_path / "a.exr", exr(fill=np.nan))
     assert np.isnan(read_exr(path)[CHANNELS[0]]).all()
@@ -408,6 +415,7 @@ def test_nan_is_black(tmp_path):
     assert not colours.alpha.any()
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     "content",
     [

@@ -13,14 +13,14 @@ import blender_primdiffusion
 from blender_primdiffusion.engine.gpu.march import GpuMarcher, GpuPayload
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def oracle(tmp_path_factory) -> Iterator[Oracle]:
     oracle = Oracle(tmp_path_factory.mktemp("oracle"))
     yield oracle
     oracle.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def folder(oracle, tmp_path_factory) -> Path:
     """The folder of a human's file."""
     return oracle.make(tmp_path_factory.mktemp("human"))

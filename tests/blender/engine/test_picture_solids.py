@@ -118,6 +118,7 @@ def test_only_changes_that_affect_solids_make_them_read_again(stage, folder):
     assert seen == [False, True, True]
 
 
+@pytest.mark.any_blender
 def test_the_file_is_named_by_its_content_and_written_once(stage, tmp_path):
     cube()
     path = stored(solids_now(), tmp_path)
@@ -132,6 +133,7 @@ def test_the_file_is_named_by_its_content_and_written_once(stage, tmp_path):
     assert stored(solids_now(), tmp_path) is None
 
 
+@pytest.mark.any_blender
 def test_a_mesh_with_nan_is_an_error_that_names_the_object(stage):
     cube("broken").data.vertices[0].co.z = float("nan")
     with refused(RuntimeError, "broken", "NaN"):
@@ -192,7 +194,7 @@ def test_depth_is_the_nearer_of_person_and_cube(pair):
     assert depth.max() == np.float32(1e10)
 
 
-@pytest.mark.parametrize("way", ["object", "collection", "setting"])
+@pytest.mark.parametrize("way", ["object", "collection", pytest.param("setting", marks=pytest.mark.any_blender)])
 def test_a_holdout_cuts_a_hole_into_person_and_background(pair, way):
     stage, box = pair
     box.location.y = -0.8
@@ -213,6 +215,7 @@ def test_a_holdout_cuts_a_hole_into_person_and_background(pair, way):
     assert picture[0, 0, 3] == 255
 
 
+@pytest.mark.any_blender
 def test_solids_can_be_ignored(pair):
     stage, box = pair
     box.hide_render = True
@@ -223,7 +226,9 @@ def test_solids_can_be_ignored(pair):
     assert np.array_equal(render_png(stage.out), alone)
 
 
-@pytest.mark.parametrize("view", ["DEPTH", "ALPHA", "BOXES"])
+@pytest.mark.parametrize(
+    "view", ["DEPTH", *(pytest.param(view, marks=pytest.mark.any_blender) for view in ("ALPHA", "BOXES"))]
+)
 def test_every_view_shows_the_person_in_its_own_way(pair, view):
     stage, box = pair
     box.hide_render = True
@@ -236,6 +241,7 @@ def test_every_view_shows_the_person_in_its_own_way(pair, view):
         assert np.abs(picture[..., 0] - colour[..., 3]).max() <= 1
 
 
+@pytest.mark.any_blender
 def test_an_empty_scene_is_its_background(stage):
     assert not render_png(stage.out).any()
     stage.scene.render.film_transparent = False

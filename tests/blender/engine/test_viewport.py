@@ -54,6 +54,7 @@ def drawn(addon):
     return SimpleNamespace(view=view, draw=draw, engine=engine, space=space, scene=bpy.context.scene)
 
 
+@pytest.mark.any_blender
 def test_a_gpu_that_cannot_draw_is_one_sentence_and_not_asked_again(drawn, monkeypatch):
     asked = []
 
@@ -69,6 +70,7 @@ def test_a_gpu_that_cannot_draw_is_one_sentence_and_not_asked_again(drawn, monke
     assert drawn.engine.redraws == 0
 
 
+@pytest.mark.any_blender
 def test_a_human_that_cannot_be_drawn_is_named_until_the_scene_changes(drawn, monkeypatch):
     def march(*_given: object) -> None:
         raise ValueError("Anna is damaged: import her again")
@@ -80,6 +82,7 @@ def test_a_human_that_cannot_be_drawn_is_named_until_the_scene_changes(drawn, mo
     assert drawn.draw() == ""
 
 
+@pytest.mark.any_blender
 def test_a_view_says_where_renders_show_something_else(drawn, monkeypatch):
     monkeypatch.setattr(drawn.view, "_march", lambda *_given: None)
     assert drawn.draw() == ""
@@ -134,12 +137,14 @@ def shown():
     return made
 
 
+@pytest.mark.any_blender
 def test_the_marched_picture_has_the_colours_that_are_shown_and_the_humans_depth(shown):
     picture = viewport.picture_above_overlays(view_of(7))
     assert (picture.colour, picture.depth) == ("mean", "depth")
     assert viewport.picture_above_overlays(view_of(8)) is None
 
 
+@pytest.mark.any_blender
 def test_colours_that_a_handler_cannot_show_stay_below(shown):
     assert viewport.picture_above_overlays(view_of(7, "AgX")) is None
     assert viewport.picture_above_overlays(view_of(7, exposure=1.0)) is None

@@ -60,6 +60,7 @@ def test_one_undo_makes_it_an_ordinary_armature_again(person):
     assert humans(bpy.context.scene)[0].asset_data is not None
 
 
+@pytest.mark.any_blender
 def test_unmarking_leaves_the_person(person):
     ops.mark_as_asset()
     with bpy.context.temp_override(id=person):  # as the panel's button
@@ -68,6 +69,7 @@ def test_unmarking_leaves_the_person(person):
     assert humans(bpy.context.scene) == [person]
 
 
+@pytest.mark.any_blender
 def test_what_cannot_be_an_asset_is_reported(addon):
     with refused(RuntimeError, "human"):
         ops.mark_as_asset()
@@ -82,6 +84,7 @@ def test_what_cannot_be_an_asset_is_reported(addon):
     assert person.asset_data is None
 
 
+@pytest.mark.any_blender
 def test_the_panel_offers_what_makes_sense(person):
     def buttons() -> list[str]:
         layout = MagicMock()

@@ -22,6 +22,8 @@ from blender_primdiffusion.jobs.volumes import MergeJob, PoseSnapshot
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import HumanTarget
 
+pytestmark = pytest.mark.any_blender
+
 
 @pytest.fixture
 def person(addon, tmp_path):

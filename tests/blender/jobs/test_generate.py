@@ -44,6 +44,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
     assert queue.info["device_name"] == "fake device"
 
 
+@pytest.mark.any_blender
 def test_what_the_human_does_not_show_is_said(addon):
     wanted = addon.scene.primdiffusion.attributes
     wanted.hat = "fedora"
@@ -93,6 +94,7 @@ def test_a_killed_child_is_reported(addon):
     assert not humans(addon.scene)
 
 
+@pytest.mark.any_blender
 def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_result(addon):
     assert "primdiffusion.generate" in panel_texts(addon)
     ask(addon, TAKES_LONG, 2)
@@ -108,6 +110,7 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
     assert any("Generated in" in text for text in panel_texts(addon))
 
 
+@pytest.mark.any_blender
 def test_a_cancel_while_the_child_is_importing_ends_the_job_and_keeps_the_child(addon, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "imports slowly")
     ask(addon, TAKES_LONG, 50)

@@ -61,6 +61,7 @@ def test_shown_in_viewports_they_are_written_and_drawn_and_undo_hides_them(perso
     assert drawn() == 0
 
 
+@pytest.mark.any_blender
 def test_a_cancelled_job_keeps_what_is_written_and_shows_nothing(person, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.volumes.SLICE_S", 1e-3)
     queue.add(bpy.context, VolumesJob(HumanTarget.of(person)))
@@ -73,6 +74,7 @@ def test_a_cancelled_job_keeps_what_is_written_and_shows_nothing(person, monkeyp
     assert not list(folder_of(person).glob(".*.partial*"))
 
 
+@pytest.mark.any_blender
 def test_a_full_disk_is_told_and_nothing_is_shown(person, full_disk):
     with pytest.raises(RuntimeError, match="No space left"):
         ops.volumes_in_viewport()
@@ -135,6 +137,7 @@ def test_a_copy_renders_what_is_written_for_both(person):
     assert folder_of(twin) == folder_of(person)
 
 
+@pytest.mark.any_blender
 def test_what_a_render_cannot_write_is_told_once(person, full_disk, capsys):
     for _ in range(2):
         write_before_rendering(bpy.context.scene)
@@ -145,6 +148,7 @@ def test_what_a_render_cannot_write_is_told_once(person, full_disk, capsys):
     assert are_written(person)
 
 
+@pytest.mark.any_blender
 def test_what_was_wrong_is_forgotten_when_the_extension_is_disabled(person):
     faults.report("the human 'Anna' cannot be drawn")
     blender_primdiffusion.unregister()
@@ -174,6 +178,7 @@ def test_volumes_that_an_opened_file_shows_are_hidden_until_they_are_written_aga
     assert drawn() == COUNT, "no view has looked for the files before they were there"
 
 
+@pytest.mark.any_blender
 def test_an_edit_on_a_full_disk_is_made_and_its_missing_volumes_are_told(person, monkeypatch):
     ops.volumes_in_viewport()
     before = folder_of(person)
@@ -222,6 +227,7 @@ def cube(empty_scene) -> bpy.types.Object:
     return bpy.context.object
 
 
+@pytest.mark.any_blender
 def test_the_share_of_height_is_that_of_the_bounding_box(cube):
     assert share_of_height(perspective(Vector((0, 0, 4.5))), cube) == pytest.approx(0.25)  # the nearer face
     assert share_of_height(perspective(Vector((0, 0, 40.5))), cube) == pytest.approx(0.025)
@@ -230,11 +236,13 @@ def test_the_share_of_height_is_that_of_the_bounding_box(cube):
     assert share_of_height(perspective(Vector((0, 0, 4.5))), cube) == pytest.approx(0.125)
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("eye", [(0, 0, -4), (0, 0, 0.2), (30, 0, 4.5), (0, -30, 4.5)], ids=str)
 def test_an_object_behind_beside_and_around_the_eye_is_not_shown(cube, eye):
     assert share_of_height(perspective(Vector(eye)), cube) == 0
 
 
+@pytest.mark.any_blender
 def test_parallel_views_are_measured_too(cube):
     window = Matrix.Diagonal((1 / 2, 1 / 2, -0.01, 1)) @ Matrix.Rotation(math.radians(90), 4, "X")
     assert share_of_height(window, cube) == pytest.approx(0.25)

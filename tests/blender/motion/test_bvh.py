@@ -19,6 +19,8 @@ from support.errors import refused
 from blender_primdiffusion.scene.armature import build_armature, keyframe_poses
 from blender_primdiffusion.scene.convention import points_to_blender
 
+pytestmark = pytest.mark.any_blender
+
 
 def test_euler_channels_are_read_in_the_order_they_are_written(tmp_path):
     rotations, moves = motion_of(1.5)

@@ -35,6 +35,7 @@ def smpl_matrices(rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return Z_UP @ synthetic.skinning(synthetic.joints(), rotations, translation) @ Z_UP.T
 
 
+@pytest.mark.any_blender
 def test_a_person_facing_plus_z_with_y_up_faces_minus_y_with_z_up():
     up, forward, left = np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
     assert points_to_blender(up).tolist() == [0, 0, 1]
@@ -42,6 +43,7 @@ def test_a_person_facing_plus_z_with_y_up_faces_minus_y_with_z_up():
     assert points_to_blender(left).tolist() == [1, 0, 0]
 
 
+@pytest.mark.any_blender
 def test_turning_points_and_turning_rotations_agree():
     rotation = synthetic.random_rotations(np.random.default_rng(0), 1)[0]
     point = np.array([0.3, -0.2, 0.9])
@@ -91,7 +93,7 @@ def test_building_keeps_the_active_object_and_leaves_the_armature_unlinked(empty
     assert made.name not in empty_scene.scene.collection.objects
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_bone_matrices_are_smpls_skinning_transforms(armature, seed):
     rng = np.random.default_rng(seed)
     rotations, translation = synthetic.random_rotations(rng, 24), rng.normal(0, 1, 3)
@@ -102,6 +104,7 @@ def test_bone_matrices_are_smpls_skinning_transforms(armature, seed):
     np.testing.assert_allclose(joint_matrices(armature), smpl_matrices(rotations, translation), atol=1e-5)
 
 
+@pytest.mark.any_blender
 def test_posing_an_armature_without_smpl_bones_names_the_missing_one(empty_scene):
     other = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
     with refused(ValueError, "Rig", "pelvis"):
@@ -123,6 +126,7 @@ def test_keyframes_meet_every_pose_and_the_frames_between_are_rotations(armature
     np.testing.assert_allclose(between @ np.swapaxes(between, 1, 2), np.tile(np.eye(3), (24, 1, 1)), atol=1e-5)
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("frames", [[1, 1], [2, 1], [1, 2, 3]])
 def test_frames_that_do_not_increase_or_do_not_match_are_rejected(armature, frames):
     with refused(ValueError, "frame"):
@@ -130,11 +134,13 @@ def test_frames_that_do_not_increase_or_do_not_match_are_rejected(armature, fram
     assert len(bpy.data.actions) == 0
 
 
+@pytest.mark.any_blender
 def test_quaternions_of_half_turns_do_not_divide_by_zero():
     half_turns = np.array([np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1]), np.eye(3)])
     np.testing.assert_allclose(np.abs(matrix_to_quaternion(half_turns)), np.eye(4)[[1, 2, 3, 0]], atol=1e-15)
 
 
+@pytest.mark.any_blender
 def test_continuous_quaternions_never_flip_and_stay_the_same_rotations():
     angle = np.linspace(0, 12, 200)
     q = matrix_to_quaternion(synthetic.axis_angle(np.stack([angle, 0 * angle, 0 * angle], -1)))

@@ -59,6 +59,7 @@ def person(saved_scene, tmp_path):
     return collection
 
 
+@pytest.mark.any_blender
 def test_an_edit_has_files_of_its_own_and_leaves_those_before(person, saved_scene, tmp_path):
     places = transforms(person)
     files = {path: path.stat().st_mtime_ns for path in folder_of(person).iterdir()}
@@ -73,6 +74,7 @@ def test_an_edit_has_files_of_its_own_and_leaves_those_before(person, saved_scen
     assert json.loads(person[MARK])["edited"] == [3, 7]
 
 
+@pytest.mark.any_blender
 def test_the_state_is_told_apart_by_what_it_holds(person, saved_scene, tmp_path):
     before = state_of(person)
     replace(person, redyed(tmp_path, 3))
@@ -137,6 +139,7 @@ def test_a_duplicate_that_shares_data_is_not_edited_with_the_original(person, sa
     assert first(twin)
 
 
+@pytest.mark.any_blender
 def test_every_part_of_a_human_leads_to_it_and_other_objects_do_not(person, saved_scene):
     hat = bpy.data.objects.new("hat", None)
     hat.parent = person

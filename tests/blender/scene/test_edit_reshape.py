@@ -86,6 +86,7 @@ def test_an_animation_turns_the_joints_as_before(person, saved_scene):
     np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2 * TOLERANCE_M)
 
 
+@pytest.mark.any_blender
 def test_changing_the_shape_and_back_is_no_change(person, saved_scene):
     before = heads(person), betas_of(person)
     reshape(person, SHAPE)
@@ -113,6 +114,7 @@ def test_mode_selection_scenes_and_objects_stay_as_they_were(person, saved_scene
     assert [obj.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for obj in kind] == before
 
 
+@pytest.mark.any_blender
 def test_files_on_disk_stay_as_they_are(person, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
     reshape(person, SHAPE)
@@ -136,6 +138,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("sentence", REFUSED)
 def test_what_cannot_be_reshaped_is_rejected_untouched(person, saved_scene, sentence):
     change, betas = REFUSED[sentence]
@@ -148,12 +151,14 @@ def test_what_cannot_be_reshaped_is_rejected_untouched(person, saved_scene, sent
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
+@pytest.mark.any_blender
 def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person):
     body_of(person).shape_key_add(name="Basis")
     assert "'Human_body' was changed by hand" in reshape(person, SHAPE)
     np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
 
 
+@pytest.mark.any_blender
 def test_without_body_mesh_the_rest_still_follows(person):
     bpy.data.objects.remove(body_of(person))
     assert reshape(person, SHAPE) == ""
@@ -190,6 +195,7 @@ def test_volumes_grow_with_half_of_the_surface_s_stretch(person):
     np.testing.assert_allclose(sizes(evaluated_matrices(person)), 1, rtol=1e-5)
 
 
+@pytest.mark.any_blender
 def test_volumes_of_an_edited_person_grow_from_the_edited_one_s_body(person, saved_scene, tmp_path):
     reshape(person, SHAPE)
     replace(person, edited_file(tmp_path, np.ones(10)))

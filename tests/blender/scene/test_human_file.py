@@ -12,6 +12,8 @@ from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
 from blender_primdiffusion.scene.shape import betas_of
 
+pytestmark = pytest.mark.any_blender
+
 COUNT = 12
 CHANGE = np.eye(10)[0] * 2.0 - np.eye(10)[1]
 SIZES = np.linspace(0.8, 1.3, 3 * COUNT, dtype="<f4").reshape(COUNT, 3)

@@ -106,6 +106,7 @@ def test_a_merged_person_moves_with_the_armature_object(person, tmp_path):
     np.testing.assert_allclose(np.array(merged.matrix_world), np.array(armature.matrix_world), atol=1e-6)
 
 
+@pytest.mark.any_blender
 def test_another_grid_has_another_name_and_the_same_one_the_same(person, tmp_path):
     first = volume_path(merge(person, tmp_path).data)
     assert volume_path(merge(person, tmp_path).data) == first
@@ -127,6 +128,7 @@ def test_a_sequence_shows_the_grid_of_its_frame(person, tmp_path):
         assert evaluated.grids.frame_filepath.endswith(f"_{shown + 1:04d}.vdb"), frame
 
 
+@pytest.mark.any_blender
 def test_a_merge_knows_the_pose_it_shows(person):
     rng = np.random.default_rng(0)
     joints = rng.normal(size=(24, 3, 4)).astype(np.float32)
@@ -140,11 +142,13 @@ def test_a_merge_knows_the_pose_it_shows(person):
     assert [several.shows(digest, frame) for frame in (4, 5, 6, 7)] == [False, False, True, True]
 
 
+@pytest.mark.any_blender
 def test_the_state_survives_on_the_object(person, tmp_path):
     merged = merge(person, tmp_path, (0, 1), start=3)
     assert merged_state(merged) == MergedState(("pose 0", "pose 1"), 0.02, 3)
 
 
+@pytest.mark.any_blender
 def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
     digest = write_grid(grid(), tmp_path / "grid.vdb")
     (tmp_path / "file").write_text("in the way")
@@ -155,6 +159,7 @@ def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
     assert not list((tmp_path / "new").iterdir())
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("content", [b"PK\x03\x04 no more", b""])
 def test_a_damaged_grid_is_rejected_with_what_to_do(tmp_path, content):
     (tmp_path / "grid.npz").write_bytes(content)
@@ -162,6 +167,7 @@ def test_a_damaged_grid_is_rejected_with_what_to_do(tmp_path, content):
         read_grid(tmp_path / "grid.npz")
 
 
+@pytest.mark.any_blender
 def test_a_grid_is_read_as_the_child_wrote_it(tmp_path):
     merged = grid()
     np.savez(tmp_path / "grid.npz", **vars(merged))
@@ -178,6 +184,7 @@ def test_the_gain_is_the_one_of_the_material_where_it_still_has_the_node(empty_s
     assert density_gain() is None
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("change", [{"density": np.nan}, {"colour": np.inf}, {"voxel": 0.0}, {"origin": 1e39}])
 def test_a_grid_of_impossible_numbers_is_rejected(tmp_path, change):
     arrays = {"density": np.ones((2, 2, 2)), "colour": np.ones((2, 2, 2, 3)), "origin": np.zeros(3)}
@@ -207,6 +214,7 @@ def test_links_in_place_of_merged_files_lose_nothing_outside(tmp_path, outside):
     assert mine.read_text() == "mine"
 
 
+@pytest.mark.any_blender
 def test_a_link_in_place_of_the_folder_is_what_the_error_is_about(tmp_path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "humans").mkdir()

@@ -73,6 +73,7 @@ def out_of_the_way(cube):
     cube.location.x = 2.5
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     "change", [hidden_in_view_layer, hidden_everywhere, drawn_as_wire, below_the_feet, above_the_head, out_of_the_way]
 )
@@ -82,6 +83,7 @@ def test_a_human_stands_at_the_cursor_where_nothing_is_in_the_way(saved_scene, s
     assert tuple(standing(source).location) == (0, 0, 0)
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("kind", ["text_add", "primitive_bezier_circle_add"])
 def test_curves_and_texts_are_in_the_way_too(saved_scene, source, kind):
     add = bpy.ops.object.text_add if kind == "text_add" else bpy.ops.curve.primitive_bezier_circle_add
@@ -98,6 +100,7 @@ def test_instances_are_in_the_way(saved_scene, source):
     assert tuple(standing(source).location) != (0, 0, 0)
 
 
+@pytest.mark.any_blender
 def test_inside_a_room_a_human_stays_clear_of_furniture_and_inside(saved_scene, source):
     bpy.ops.mesh.primitive_cube_add(size=1)
     room = bpy.context.object
@@ -108,11 +111,13 @@ def test_inside_a_room_a_human_stays_clear_of_furniture_and_inside(saved_scene, 
     assert max(abs(x), abs(y)) < 3.5
 
 
+@pytest.mark.any_blender
 def test_where_nothing_within_reach_is_free_a_human_stands_at_the_cursor(saved_scene, source):
     bpy.ops.mesh.primitive_plane_add(size=10 * REACH_M, location=(0, 0, 1))
     assert tuple(standing(source).location) == (0, 0, 0)
 
 
+@pytest.mark.any_blender
 def test_on_uneven_ground_humans_stand_side_by_side(saved_scene, source):
     bpy.ops.mesh.primitive_cube_add(size=1)
     bpy.context.object.scale = (60, 60, 1)  # half a metre above the soles, as a hill elsewhere would be

@@ -21,6 +21,7 @@ def views() -> list[bpy.types.SpaceView3D]:
     return [space for space in spaces if space.type == "VIEW_3D"]
 
 
+@pytest.mark.any_blender
 def test_solid_shading_shows_textures_unless_the_user_has_chosen_other_colours():
     bpy.ops.wm.read_factory_settings()
     first, second, wires, *_ = views()
@@ -44,6 +45,7 @@ def test_a_proxys_material_is_shown_with_its_texture_or_its_mean_colour(saved_sc
     assert list(material.diffuse_color) == pytest.approx([1.0, 0.0, 0.0, 1.0], abs=1e-4)
 
 
+@pytest.mark.any_blender
 def test_a_proxy_of_another_shape_is_outdated_and_none_is_made(saved_scene, tmp_path):
     exporting.write_store(tmp_path)
     person = exporting.add_person(tmp_path)

@@ -63,7 +63,7 @@ def test_a_merged_box_has_its_colour_opacity_size_and_place_in_cycles(person, tm
     np.testing.assert_allclose(edges, expected, atol=1.5)
 
 
-@pytest.mark.parametrize("mode", ["VOLUMES", "MERGED"])
+@pytest.mark.parametrize("mode", ["VOLUMES", pytest.param("MERGED", marks=pytest.mark.any_blender)])
 def test_the_engine_draws_the_person_alone_in_every_mode(person, tmp_path, mode):
     bpy.utils.expose_bundled_modules()
     turns = np.zeros((24, 3))

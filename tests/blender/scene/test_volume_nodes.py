@@ -112,6 +112,7 @@ def test_deleted_volumes_are_made_again_when_they_are_asked_for(person):
     assert are_written(human)
 
 
+@pytest.mark.any_blender
 def test_a_deleted_body_is_rejected_with_what_to_do(person):
     bpy.data.objects.remove(body_of(person[0]))
     bpy.data.objects.remove(volumes_of(person[0]))
@@ -119,6 +120,7 @@ def test_a_deleted_body_is_rejected_with_what_to_do(person):
         set_representation(person[0], "VOLUMES")
 
 
+@pytest.mark.any_blender
 def test_unknown_representations_and_what_is_not_merged_are_rejected(person):
     with refused(ValueError, "VOLUMES", "MERGED", "SPLATS"):
         set_representation(person[0], "BONES")

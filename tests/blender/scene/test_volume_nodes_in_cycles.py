@@ -96,6 +96,7 @@ def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path)
         assert (high > low).all()
 
 
+@pytest.mark.any_blender
 def test_an_empty_scene_has_no_human_to_frame(empty_scene):
     with refused(ValueError, "human"):
         setup_cycles_preview(bpy.context.scene)

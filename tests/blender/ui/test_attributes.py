@@ -16,6 +16,8 @@ from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import edit_panel
 from blender_primdiffusion.ui import generate_settings as attributes
 
+pytestmark = pytest.mark.any_blender
+
 VOCABULARY = {
     "categories": {"sex": ["female", "male"], "outfit": ["suit", "fitted tee and jeans"], "age": ["old"]},
     "scalars": {"height": [1.7, 0.1]},

@@ -7,6 +7,8 @@ from blender_primdiffusion.formats.schema import Range, Slider, descriptions, fi
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.formats import requests
 
+pytestmark = pytest.mark.any_blender
+
 LARGEST = 2**31 - 1
 SETTINGS = {
     "primdiffusion": (requests.GenerateRequest, ("steps", "guidance", "seed")),

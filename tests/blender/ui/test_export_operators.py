@@ -24,6 +24,8 @@ from blender_primdiffusion.scene.volume_nodes import volumes_of
 from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
 from blender_primdiffusion.ui.export_panel import draw_as_mesh
 
+pytestmark = pytest.mark.any_blender
+
 OPERATORS = bpy.ops.primdiffusion
 
 
@@ -90,7 +92,6 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     assert not list(out.iterdir())
 
 
-@pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("operator", "properties", "sentence"),
     [

@@ -20,6 +20,8 @@ from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.place import GAP_M, posed_extent
 from blender_primdiffusion.ui import generate_panel
 
+pytestmark = pytest.mark.any_blender
+
 
 @pytest.fixture
 def panel_settings(addon):

@@ -30,6 +30,8 @@ from blender_primdiffusion.ui.shape_panel import (
     draw_shape,
 )
 
+pytestmark = pytest.mark.any_blender
+
 ops = bpy.ops.primdiffusion
 TALL = [2.0] + [0.0] * 9
 

@@ -24,6 +24,8 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui.import_motion import PRIMDIFFUSION_OT_import_motion, look_at, nearest_to
 
+pytestmark = pytest.mark.any_blender
+
 ops = bpy.ops.primdiffusion
 
 

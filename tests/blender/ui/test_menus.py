@@ -8,6 +8,8 @@ from jobs_driven import shown
 
 from blender_primdiffusion.ui import menus, preferences
 
+pytestmark = pytest.mark.any_blender
+
 
 def offered(monkeypatch, named: bool, state: str = "ready") -> list[str]:
     """Operators of Add > Human, with and without a backend, and a Python that runs it."""

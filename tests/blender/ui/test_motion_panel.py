@@ -28,6 +28,7 @@ def test_appending_continues_after_the_last_key_without_a_flip(addon, armature, 
     assert (values[:, 1:] * values[:, :-1]).sum(0).min() > 0
 
 
+@pytest.mark.any_blender
 def test_appending_to_nothing_is_rejected_and_leaves_nothing(addon, armature):
     before = len(bpy.data.actions)
     with pytest.raises(RuntimeError, match="no motion to append to"):
@@ -66,6 +67,7 @@ def test_a_looped_walk_continues_from_where_it_has_got_to(addon, armature):
     assert not armature.primdiffusion_human.loop, "there is nothing to loop"
 
 
+@pytest.mark.any_blender
 def test_built_in_motion_fits_long_and_short_legs(addon, armature):
     ops.add_motion(motion="WALK", rounds=1, speed=2.0)
     heights = []
@@ -76,6 +78,7 @@ def test_built_in_motion_fits_long_and_short_legs(addon, armature):
     assert max(heights) < 0.03
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("fps", [24, 25, 60])
 @pytest.mark.parametrize("motion", ["WALK", "IDLE", "WAVE"])
 def test_a_round_ends_on_a_whole_frame_as_it_began(addon, armature, motion, fps):
@@ -109,6 +112,7 @@ def test_exported_motion_comes_back_the_same(addon, armature, tmp_path):
     assert len(bpy.data.scenes) == 1
 
 
+@pytest.mark.any_blender
 def test_exported_translations_are_of_smpls_own_body_wherever_the_armature_has_its_origin(addon, armature, tmp_path):
     armature.location = (1.0, 2.0, 3.0)
     ops.export_motion(filepath=str(tmp_path / "rest.npz"), first=1, last=1)
@@ -118,6 +122,7 @@ def test_exported_translations_are_of_smpls_own_body_wherever_the_armature_has_i
         np.testing.assert_allclose(pelvis + arrays["trans"][0], upright, atol=1e-6)
 
 
+@pytest.mark.any_blender
 def test_export_counts_constraints_and_rejects_an_empty_range(addon, armature, tmp_path):
     constraint = armature.pose.bones["head"].constraints.new("LIMIT_ROTATION")
     constraint.use_limit_y = True

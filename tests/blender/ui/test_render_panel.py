@@ -72,6 +72,7 @@ def test_a_merged_pose_is_one_undo_step_and_unmerging_goes_back(person):
     assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
 
 
+@pytest.mark.any_blender
 def test_the_panel_reports_a_changed_pose(person):
     raise_left_arm(person, 0.3)
     ops.merge()
@@ -115,6 +116,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     assert not merged_of(person).data.is_sequence
 
 
+@pytest.mark.any_blender
 def test_a_range_that_is_none_is_rejected(person):
     bpy.context.scene.frame_start = bpy.context.scene.frame_end = 7
     with refused(RuntimeError, "7 to 7"):
@@ -122,6 +124,7 @@ def test_a_range_that_is_none_is_rejected(person):
     assert merged_of(person) is None
 
 
+@pytest.mark.any_blender
 def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "takes long")
     moment = PoseSnapshot.capture(person)
@@ -158,6 +161,7 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
     assert sorted(folder_of(person).iterdir()) == before
 
 
+@pytest.mark.any_blender
 def test_a_human_removed_meanwhile_is_not_merged(person):
     queue.add(bpy.context, MergeJob(HumanTarget.of(person), [PoseSnapshot.capture(person)], 0.02))
     remove_human(person)
@@ -165,6 +169,7 @@ def test_a_human_removed_meanwhile_is_not_merged(person):
     assert "was removed" in error_of("merge")
 
 
+@pytest.mark.any_blender
 def test_set_representation_reports_what_stands_in_the_way(person):
     with refused(RuntimeError, "Merge"):
         ops.set_representation(representation="MERGED")
@@ -204,6 +209,7 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     scene.render.engine = "CYCLES"
 
 
+@pytest.mark.any_blender
 def test_before_the_backend_is_set_up_cycles_alone_is_offered_and_nothing_is_merged(person, monkeypatch):
     monkeypatch.setattr(render_panel, "known", lambda: preferences.Known("absent", ""))
     assert shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context).count("primdiffusion.set_up_engine") == 1
@@ -242,6 +248,7 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
     assert any(light.type == "SUN" for light in bpy.data.lights)
 
 
+@pytest.mark.any_blender
 def test_our_engine_leads_to_the_set_up_where_no_backend_would_render(person, monkeypatch):
     monkeypatch.setattr(preferences, "known", lambda: preferences.Known("absent", "The backend is not set up yet"))
     bpy.context.scene.render.engine = "PRIMDIFFUSION"

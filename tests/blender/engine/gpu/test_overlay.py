@@ -103,6 +103,7 @@ def test_humans_whose_volumes_a_view_lights_are_left_to_its_engine(people):
     assert names(read(people.overlay, shading="RENDERED")) == ["Anna", "Bert"]
 
 
+@pytest.mark.any_blender
 def test_views_of_several_shadings_do_not_share_what_they_show(people):
     bpy.context.scene.render.engine = "CYCLES"
     volumes_of(people.bert).hide_viewport = False
@@ -112,6 +113,7 @@ def test_views_of_several_shadings_do_not_share_what_they_show(people):
     assert people.overlay.reading(context()) is solid
 
 
+@pytest.mark.any_blender
 def test_humans_whose_meshes_viewports_show_are_not_drawn_twice(people):
     assert names(read(people.overlay)) == ["Anna", "Bert"]
     body_of(people.anna).hide_viewport = False
@@ -134,6 +136,7 @@ def test_an_instance_is_drawn_and_stands_for_its_human(people):
     np.testing.assert_allclose(pelvis["Instance"] - pelvis["Anna"], [3, 0, 0], atol=1e-5)
 
 
+@pytest.mark.any_blender
 def test_a_human_without_data_is_named_and_the_others_are_drawn(people):
     lose_data(people.anna)
     assert names(read(people.overlay)) == ["Bert"]
@@ -143,6 +146,7 @@ def test_a_human_without_data_is_named_and_the_others_are_drawn(people):
     assert people.overlay.error == "", "the fog shows her"
 
 
+@pytest.mark.any_blender
 def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
     monkeypatch.setattr(scene_reading, "READING_S", -1.0)
     first = read(people.overlay)
@@ -155,6 +159,7 @@ def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
     assert people.overlay.resting
 
 
+@pytest.mark.any_blender
 def test_marching_and_drawing_are_steps_of_their_own(monkeypatch):
     own, news = Overlay(), [False, True, True]
     pictures = SimpleNamespace(resting=False, fresh=False, advance=lambda: news.pop(0))
@@ -170,6 +175,7 @@ def test_marching_and_drawing_are_steps_of_their_own(monkeypatch):
     assert own.resting
 
 
+@pytest.mark.any_blender
 def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
     reading = read(people.overlay)
     assert people.overlay.reading(context()) is reading
@@ -209,6 +215,7 @@ def test_bones_are_in_front_while_they_are_posed_or_edited(people, mode):
     assert not armature.show_in_front, "the user's own setting stays"
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
 def test_a_pixel_at_a_depth_is_a_point_of_the_world(matrix):
     point = module._point(context(matrix), 12, 20, 4.0)
@@ -217,6 +224,7 @@ def test_a_pixel_at_a_depth_is_a_point_of_the_world(matrix):
     assert (LOOK_ALONG_Y @ [*point, 1])[2] == pytest.approx(-4.0)
 
 
+@pytest.mark.any_blender
 def test_clip_planes_follow_from_the_projection():
     assert clip_of(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
     assert clip_of(PARALLEL) == pytest.approx((-500, 500))
@@ -235,6 +243,7 @@ def pixel_of(matrix, point) -> tuple[int, int]:
     return tuple(((clip[:2] / clip[3] + 1) / 2 * SIZE).astype(int))
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
 def test_a_click_finds_the_nearest_human(people, matrix):
     around = clickable(people, matrix)
@@ -242,6 +251,7 @@ def test_a_click_finds_the_nearest_human(people, matrix):
         assert people.overlay.object_at(around, *pixel_of(matrix, (x, 0, 1))).name == name
 
 
+@pytest.mark.any_blender
 def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
     pixel = pixel_of(PERSPECTIVE, (0.0, 0, 1))
     cube(centre=(0, 2, 1))
@@ -254,6 +264,7 @@ def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
     assert people.overlay.object_at(context(), *pixel) is None
 
 
+@pytest.mark.any_blender
 def test_clicks_select_extend_and_deselect(people, monkeypatch):
     monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
     event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
@@ -281,6 +292,7 @@ def test_clicks_select_extend_and_deselect(people, monkeypatch):
     assert pass_through == {"PASS_THROUGH"}
 
 
+@pytest.mark.any_blender
 def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
     monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
     click, held, begun = PRIMDIFFUSION_OT_click_human, SimpleNamespace(extend=False), []
@@ -298,6 +310,7 @@ def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
         assert click.modal(held, around, SimpleNamespace(type=kind, value=value)) == result
 
 
+@pytest.mark.any_blender
 def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(people, monkeypatch):
     drawn = []
     monkeypatch.setattr(module, "overlay", people.overlay)
@@ -333,6 +346,7 @@ class Marched:
         pass
 
 
+@pytest.mark.any_blender
 def test_a_gpu_that_cannot_march_is_not_asked_again_and_the_view_says_why(people, monkeypatch):
     asked = []
 
@@ -348,6 +362,7 @@ def test_a_gpu_that_cannot_march_is_not_asked_again_and_the_view_says_why(people
     assert people.overlay.resting
 
 
+@pytest.mark.any_blender
 def test_a_gpu_that_fails_while_a_view_rests_is_noticed(people, monkeypatch):
     drawn = drawing(monkeypatch, Marched)
     people.overlay.draw(context())
@@ -364,6 +379,7 @@ def test_a_gpu_that_fails_while_a_view_rests_is_noticed(people, monkeypatch):
     assert people.overlay.resting
 
 
+@pytest.mark.any_blender
 def test_each_redraw_of_a_moving_view_shows_all_of_the_new_one(people, monkeypatch):
     drawn = drawing(monkeypatch, Marched)
     for turn in range(5):
@@ -377,6 +393,7 @@ def test_each_redraw_of_a_moving_view_shows_all_of_the_new_one(people, monkeypat
     assert (first.view.width, first.step) == (SIZE[0] // 8, 8 * step)
 
 
+@pytest.mark.any_blender
 def test_a_view_that_the_engine_draws_now_is_not_refined_beside_it(monkeypatch):
     shown, overlay = context(), Overlay()
     overlay._picture_of(shown.region).want(MarchRequest("before", None, None))
