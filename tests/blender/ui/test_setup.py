@@ -122,9 +122,6 @@ def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypat
     monkeypatch.setattr(ui_setup, "available", lambda: {"cpu": ours})
     with refused(RuntimeError, "differs"):
         press.set_up_backend(choose=True, directory=str(wheels))
-    write_lock(wheels / ui_setup.OWN_LOCK, sorted(wheels.glob("*.whl"))[:1])
-    with refused(RuntimeError, "torch"):
-        press.set_up_backend(choose=True, directory=str(wheels))
     write_lock(wheels / ui_setup.OWN_LOCK, sorted(wheels.glob("*.whl")))
     assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
     assert state_of(places.set_up_folder())[1]["lock_name"] == "requirements.txt"
