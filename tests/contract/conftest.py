@@ -22,9 +22,9 @@ def slow_checkpoint(tmp_path_factory) -> Path:
     return save_tiny_checkpoint(tmp_path_factory.mktemp("slow_checkpoint") / "slow.safetensors", SLOW)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def child():
-    """A real child, which is asked line by line."""
+    """A real child, which is asked line by line. Starting one takes seconds: all tests share it."""
     child = Conversation()
     yield child
     child.close()

@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 import pytest
 from packaging.requirements import Requirement
 from primdiffusion.files.regular_files import portable_name
+from support.fake_child import FAILS, FAKE_CHILD
 
 from scripts.setup import TARGETS
 
@@ -94,11 +95,11 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
         ("drive_the_child.py", ["--steps", "2"], {"person.human.safetensors", "front.png"}),
     ],
 )
-def test_an_example_leaves_its_files(script, options, files, checkpoint, tmp_path):
+def test_an_example_leaves_its_files(script, options, files, checkpoint, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    command = [sys.executable, EXAMPLES / script, "--out", out, "--checkpoint", checkpoint, *options]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
-    assert done.returncode == 0, done.stderr
+    words = [script, "--out", str(out), "--checkpoint", str(checkpoint), *options]
+    monkeypatch.setattr(sys, "argv", words)
+    runpy.run_path(str(EXAMPLES / script), run_name="__main__")
     assert files <= {path.name for path in out.iterdir()}
 
 
@@ -111,8 +112,8 @@ def test_the_page_is_served_to_this_machine_alone(checkpoint, monkeypatch):
     page.launch.assert_called_once_with(server_name="127.0.0.1", share=False)
 
 
-def test_the_example_of_the_child_passes_its_sentence_on(tmp_path):
-    command = [sys.executable, EXAMPLES / "drive_the_child.py", "--out", tmp_path / "out", "--checkpoint", "nowhere"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
-    assert done.returncode == 1
-    assert "nowhere" in done.stderr.splitlines()[-1]
+def test_the_example_of_the_child_passes_its_sentence_on(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(FAKE_CHILD))
+    monkeypatch.setattr(sys, "argv", ["drive_the_child.py", "--out", str(tmp_path / "out"), "--seed", str(FAILS)])
+    with pytest.raises(SystemExit, match="the checkpoint is damaged"):
+        runpy.run_path(str(EXAMPLES / "drive_the_child.py"), run_name="__main__")

@@ -112,19 +112,6 @@ def test_a_large_picture_comes_in_bands_from_the_top_and_stops_within_one(child,
     assert "result" in answer, "the next picture is drawn"
 
 
-def test_drawing_needs_no_checkpoint(request_for):
-    without = (
-        "import primdiffusion.diffusion.checkpoint as d\n"
-        "def gone(*_): raise FileNotFoundError('no checkpoint here')\n"
-        "d.load_checkpoint = d.default_checkpoint = gone\n"
-        "import primdiffusion.serve.server as s; s.main()"
-    )
-    child = Conversation(("-c", without))
-    answer, _ = ask(child, request_for())
-    child.close()
-    assert "result" in answer
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

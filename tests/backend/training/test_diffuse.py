@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -64,28 +63,9 @@ def few(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def whole(people, tmp_path_factory):
-    """A run that nothing disturbed."""
-    with pytest.MonkeyPatch.context() as patch:
-        make_small(patch)
-        config = settings(people, tmp_path_factory.mktemp("whole") / "run", made_of="makehuman")
-        train(config)
-        return config.run
-
-
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     make_small(monkeypatch)
-
-
-@pytest.fixture
-def run(whole, tmp_path):
-    """A run's folder in which the closed-form part is done already."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    os.link(whole / "prepared.safetensors", folder / "prepared.safetensors")
-    return folder
 
 
 def after(steps):

@@ -12,13 +12,15 @@ from diffuse_runs import make_small, settings
 from primdiffusion.files.folder_lock import lock_folder
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.runtime.failures import MissingPackageError
-from primdiffusion.training.config import TrainingConfig, check_resumable, to_json
+from primdiffusion.training.config import PhaseConfig, TrainingConfig, check_resumable, to_json
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.run_folder import open_metrics
 from support.errors import refused
 from support.runs import rows
+
+FEW = {"person": PhaseConfig(steps=2, batch=4, evaluate_every=2), "local": PhaseConfig(steps=1, batch=1)}
 
 
 @pytest.mark.parametrize(
@@ -36,10 +38,9 @@ def test_a_second_run_in_a_folder_is_rejected(tmp_path, start):
 
 
 @pytest.mark.parametrize("name", ["metrics.jsonl", "pictures", "tensorboard", ".lock"])
-def test_nothing_is_written_through_a_link_in_a_strangers_run_folder(people, tmp_path, name, monkeypatch):
+def test_nothing_is_written_through_a_link_in_a_strangers_run_folder(people, run, tmp_path, name, monkeypatch):
     diffuse_runs.make_small(monkeypatch)
-    outside, run = tmp_path / "outside", tmp_path / "run"
-    run.mkdir()
+    outside = tmp_path / "outside"
     if name in ("metrics.jsonl", ".lock"):
         outside.write_text("mine")
     else:
@@ -77,12 +78,12 @@ class Wandb(types.ModuleType):
         self.finished = True
 
 
-def test_tensorboard_gets_every_number_of_every_phase(people, tmp_path, monkeypatch):
+def test_tensorboard_gets_every_number_of_every_phase(people, run, monkeypatch):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     make_small(monkeypatch)
-    config = settings(people, tmp_path / "run", tracker="tensorboard")
+    config = settings(people, run, tracker="tensorboard", **FEW)
     train(config)
     events = EventAccumulator(str(config.run / "tensorboard"), size_guidance={"scalars": 0}).Reload()
     offset = {"person": 0, "local": config.person.steps}
@@ -93,11 +94,11 @@ def test_tensorboard_gets_every_number_of_every_phase(people, tmp_path, monkeypa
             assert sent[offset[phase] + row["step"]] == pytest.approx(value, rel=1e-5)
 
 
-def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, tmp_path, monkeypatch):
+def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, run, monkeypatch):
     make_small(monkeypatch)
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
-    config = settings(people, tmp_path / "run", tracker="wandb")
+    config = settings(people, run, tracker="wandb", **FEW)
     train(config)
     assert wandb.settings == {"project": "primdiffusion", "name": "run", "dir": str(config.run)}
     assert wandb.finished
