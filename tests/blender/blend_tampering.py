@@ -344,9 +344,11 @@ def attempt(name: str, value: object, stage: Stage, source: Path) -> list[str]:
     return [*filter(None, faults), *stage.changed_outside(before)]
 
 
-def tried(name: str, pristine: Stage, folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """Each value of a property, and what it did; in copies of `pristine` at `folder`, which is removed each time."""
-    for what in values(name, pristine):
+def tried(name: str, pristine: Stage, folder: Path, every: int = 1) -> Iterator[tuple[str, list[str]]]:
+    """Each value of a property, and what it did; in copies of `pristine` at `folder`, which is removed each time.
+
+    Of every so many values one, so that the properties together are tried with all."""
+    for what in list(values(name, pristine))[list(PROPERTIES).index(name) % every :: every]:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(pristine.root, folder, symlinks=True)
         stage = Stage(folder)

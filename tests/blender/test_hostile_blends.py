@@ -34,9 +34,10 @@ def pristine(addon, tmp_path):
 
 
 @pytest.mark.any_blender  # properties are read alike by all; the tests below save and open files on each
+@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", PROPERTIES)
-def test_no_value_of_a_property_leaves_the_folder_or_raises(pristine, tmp_path, name):
-    faults = {what: found for what, found in tried(name, pristine, tmp_path / "case") if found}
+def test_no_value_of_a_property_leaves_the_folder_or_raises(pristine, tmp_path, name, every):
+    faults = {what: found for what, found in tried(name, pristine, tmp_path / "case", every) if found}
     assert not faults, "\n".join(f"{what}: {fault}" for what, found in faults.items() for fault in found)
     assert pristine.users.read_bytes() == SECRET
 

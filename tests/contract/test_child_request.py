@@ -80,14 +80,6 @@ def test_a_cancelled_request_leaves_nothing(start, slow_checkpoint, tmp_path):
     assert request.result is None
 
 
-def test_a_request_cancelled_before_the_child_is_up_is_cancelled(checkpoint, tmp_path):
-    backend = this_pythons_backend()
-    request = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
-    request.cancel()
-    assert follow(request) == ["cancelling", "cancelled"]
-    backend.shutdown()
-
-
 def test_the_second_of_two_clicks_is_rejected_with_a_sentence_and_the_first_goes_on(start):
     first, second = start(3), start(3, "second")
     assert second.state == "failed"

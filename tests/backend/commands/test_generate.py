@@ -23,6 +23,7 @@ from primdiffusion.human_file import load_human
 from primdiffusion.render.march import RELEASED
 from primdiffusion.render.reference import march_reference
 from support.runs import ended_at_each_report
+from tiny_encoder import save_tiny_encoder
 from tiny_model import model_of_two_kinds, save_tiny_checkpoint
 
 
@@ -47,16 +48,17 @@ def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint
     ]
 
 
-def test_the_model_stays_loaded_until_another_is_asked_for(checkpoint, tmp_path, monkeypatch, only_sampling):
-    loaded = []
-    load = session.load_checkpoint
-    monkeypatch.setattr(session, "load_checkpoint", lambda path, device: loaded.append(path) or load(path, device))
-    other = save_tiny_checkpoint(tmp_path / "other.safetensors")
-    one = Session()
-    for path in (checkpoint, checkpoint, other, checkpoint):
-        request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=1, checkpoint=path)
-        generate(request, one, lambda *report: None)
-    assert loaded == [checkpoint, other, checkpoint]
+@pytest.mark.parametrize(
+    ("load", "kind", "save"),
+    [("load_checkpoint", "model", save_tiny_checkpoint), ("load_encoder", "encoder", save_tiny_encoder)],
+)
+def test_a_model_stays_loaded_until_another_is_asked_for(tmp_path, monkeypatch, load, kind, save):
+    loaded, read, one = [], getattr(session, load), Session()
+    monkeypatch.setattr(session, load, lambda path, device: loaded.append(path) or read(path, device))
+    first, second = (save(tmp_path / f"{name}.safetensors") for name in "ab")
+    for path in (first, first, second, first):
+        getattr(one, kind)(path)
+    assert loaded == [first, second, first]
 
 
 def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):

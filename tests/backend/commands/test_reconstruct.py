@@ -13,9 +13,8 @@ from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.render import render
 from primdiffusion.commands import reconstruct as commands
-from primdiffusion.commands import session as session_module
 from primdiffusion.commands.session import Session
-from primdiffusion.encoder.model import EncoderModel, load_encoder
+from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.formats.requests import ReconstructRequest
@@ -145,20 +144,6 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
     person = captured_person(turned)
     assert (person.cameras, person.warnings) == ((0, 1, 2, 3, 4), ())
     assert torch.allclose(reconstruct(tiny_encoder(), person).payload.rgb, whole.payload.rgb, atol=1e-4)
-
-
-def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
-    loaded = []
-    load = load_encoder
-    monkeypatch.setattr(commands, "write_human", lambda *_: None)
-    counted = lambda path, device: loaded.append(path) or load(path, device)  # noqa: E731
-    monkeypatch.setattr(session_module, "load_encoder", counted)
-    other = save_tiny_encoder(tmp_path / "other.safetensors")
-    session = Session()
-    for path in (checkpoint, checkpoint, other):
-        request = ReconstructRequest(capture=dataset / FIRST, out_dir=tmp_path / "out", views=2, checkpoint=path)
-        commands.reconstruct(request, session, lambda *report: None)
-    assert loaded == [checkpoint, other]
 
 
 def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
