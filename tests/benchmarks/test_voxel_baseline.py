@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 from capture_scenes import captured
-from encoder_paper_form import FORMS, figures_of, measured, train
+from encoder_paper_form import figures_of, measured, train
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
-from primdiffusion.encoder.config import PAPER, PRESETS, encoder_config
+from primdiffusion.encoder.config import PRESETS
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
-from support.errors import refused
 from tiny_encoder import TINY
 from voxel_baseline import (
     BLOCKS,
@@ -76,13 +75,6 @@ def test_where_boxes_overlap_densities_add_and_colours_mix_by_density():
     near = grid[(places() - frames.position[0]).norm(dim=-1) < 0.1]
     assert torch.allclose(near[:, 3], torch.tensor(0.4), atol=0.02)
     assert torch.allclose(decode_srgb(near[:, :3]), torch.tensor([0.75, 0.0, 0.25]), atol=0.01)
-
-
-def test_delta_scale_makes_boxes_larger():
-    frames, payload = boxes((0.0, 0.0, 0.05)), plain(1, (0.5, 0.5, 0.5), 60.0)
-    large = Payload(payload.rgb, payload.density, 2 * payload.delta_scale)
-    filled = [int((voxelise_payload(frames, one, FULL)[..., 3] > 0).sum()) for one in (payload, large)]
-    assert filled[1] > 3 * filled[0]
 
 
 def test_a_grid_is_drawn_as_the_boxes_it_was_gathered_from():
@@ -186,27 +178,6 @@ def test_baseline_is_stored_whole(model, tmp_path):
     assert again.card == model.card
     assert torch.equal(next(again.sample([1], steps=2)).grid, next(model.sample([1], steps=2)).grid)
     assert torch.equal(again.shapes.scale, model.shapes.scale)
-
-
-def test_another_file_is_no_baseline(tmp_path):
-    with refused(FileNotFoundError, "baseline"):
-        load_voxel_model(tmp_path / "none.safetensors")
-    (tmp_path / "other.safetensors").write_bytes(b"nothing at all")
-    with pytest.raises(ValueError, match="train it again"):
-        load_voxel_model(tmp_path / "other.safetensors")
-
-
-def test_forms_differ_from_the_papers_in_one_setting():
-    forms = {name: vars(encoder_config("paper", ablation)) for name, ablation in FORMS.items()}
-    paper = vars(PAPER)
-    found = {name: {key for key in paper if form[key] != paper[key]} for name, form in forms.items()}
-    expected = {
-        "full": set(),
-        "shared_scale": {"delta_scale"},
-        "template_rt": {"frames"},
-        "no_attention": {"attention"},
-    }
-    assert found == expected
 
 
 @pytest.fixture(scope="module")

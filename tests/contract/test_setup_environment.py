@@ -140,23 +140,17 @@ def test_pip_gets_the_lock_as_it_was_checked(place):
         read_lock(place.lock)
 
 
-def test_a_web_page_among_the_wheels_is_named_before_anything_is_made(place):
-    (place.wheels / "links.HTM").write_text('<a href="http://localhost:9/torch-9-py3-none-any.whl">')
-    assert "links.HTM is a web page" in failed(place.from_folder())
-    assert not place.folder.root.exists()
-
-
-def test_a_folder_in_place_of_a_wheel_is_named_before_anything_is_made(place):
-    (place.wheels / "idna-3.10-py3-none-any.whl").mkdir()
-    with refused(IsADirectoryError, "idna-3.10"):
-        done(place.from_folder())
-    assert not place.folder.root.exists()
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
-def test_a_pipe_among_the_wheels_is_named_before_anything_is_made(place):
-    os.mkfifo(place.wheels / "torch-9-py3-none-any.whl")
-    with refused(PermissionError, "torch-9"):
+@pytest.mark.parametrize(
+    ("name", "put", "error"),
+    [
+        ("links.HTM", lambda path: path.write_text('<a href="http://localhost:9/torch-9.whl">'), RuntimeError),
+        ("idna-3.10-py3-none-any.whl", Path.mkdir, IsADirectoryError),
+        pytest.param("torch-9-py3-none-any.whl", lambda path: os.mkfifo(path), PermissionError, marks=pytest.mark.unix),
+    ],
+)
+def test_what_is_no_wheel_is_named_before_anything_is_made(place, name, put, error):
+    put(place.wheels / name)
+    with refused(error, name):
         done(place.from_folder())
     assert not place.folder.root.exists()
 

@@ -16,7 +16,7 @@ from blender_primdiffusion.engine.picture import PosedHuman
 from blender_primdiffusion.scene.human_file import default_body, read_payload, read_sizes, read_tensors
 
 pytestmark = pytest.mark.any_blender
-CASES = 20
+CASES = 12
 
 
 def made(folder: Path, kind: str) -> SimpleNamespace:

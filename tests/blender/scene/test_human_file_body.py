@@ -12,6 +12,8 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.human_file import body_beside, read_payload, shape_model_of
 
+pytestmark = pytest.mark.any_blender
+
 SPOILED = {
     "shape_basis": {"shape_basis": np.zeros((7, 3, 10))},
     "template": {"template": np.full((736, 3), np.nan)},
@@ -34,7 +36,6 @@ def body_file(person):
     return folder_of(person) / tensor_files.BODY
 
 
-@pytest.mark.any_blender
 @pytest.mark.parametrize("name", SPOILED)
 def test_a_broken_field_is_named_in_one_sentence(tmp_path, name):
     path = synthetic_shape.write(tmp_path / "human", **SPOILED[name])
@@ -42,14 +43,12 @@ def test_a_broken_field_is_named_in_one_sentence(tmp_path, name):
         body_beside(path, read_payload(path))
 
 
-@pytest.mark.any_blender
 def test_the_model_comes_back_from_its_file_bit_for_bit(person):
     written, back = synthetic_shape.arrays(), shape_model_of(person)
     for name in ("template", "shape_basis", "joint_basis", "faces", "stencil_vertex", "stencil_du", "skin_weights"):
         np.testing.assert_array_equal(getattr(back, name), written[name])
 
 
-@pytest.mark.any_blender
 def test_a_missing_or_damaged_file_is_named_with_what_to_do(tmp_path):
     file = synthetic_shape.write(tmp_path / "human")
     path = file.with_name(tensor_files.BODY)

@@ -15,13 +15,14 @@ from blender_primdiffusion.scene.human import HumanTarget
 from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, read_proxy, show_textures_in_solid
 from blender_primdiffusion.scene.shape import betas_of
 
+pytestmark = pytest.mark.any_blender
+
 
 def views() -> list[bpy.types.SpaceView3D]:
     spaces = (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces)
     return [space for space in spaces if space.type == "VIEW_3D"]
 
 
-@pytest.mark.any_blender
 def test_solid_shading_shows_textures_unless_the_user_has_chosen_other_colours():
     bpy.ops.wm.read_factory_settings()
     first, second, wires, *_ = views()
@@ -45,7 +46,6 @@ def test_a_proxys_material_is_shown_with_its_texture_or_its_mean_colour(saved_sc
     assert list(material.diffuse_color) == pytest.approx([1.0, 0.0, 0.0, 1.0], abs=1e-4)
 
 
-@pytest.mark.any_blender
 def test_a_proxy_of_another_shape_is_outdated_and_none_is_made(saved_scene, tmp_path):
     exporting.write_store(tmp_path)
     person = exporting.add_person(tmp_path)

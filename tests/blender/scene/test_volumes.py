@@ -11,6 +11,8 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.volume_nodes import FILES
 from blender_primdiffusion.scene.volumes import FAINTEST, bake, window, write_volume
 
+pytestmark = pytest.mark.any_blender
+
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
 
@@ -33,7 +35,6 @@ def grids(human):
     return bake(human["density"], human["rgb"], human["half_extent"])
 
 
-@pytest.mark.any_blender
 def test_the_window_is_the_marchers():
     y = [-1 + 2 * i / 7 for i in range(8)]
     assert window()[1, 2, 6] == pytest.approx(np.exp(-8 * (y[1] ** 8 + y[2] ** 8 + y[6] ** 8)), rel=1e-12)
@@ -62,7 +63,6 @@ def test_files_hold_the_windowed_payload_at_half_precision_with_x_along_t(human,
         )
 
 
-@pytest.mark.any_blender
 def test_one_empty_voxel_surrounds_the_dense_ones_and_no_more_is_stored(human, tmp_path):
     density = np.zeros((3, 8, 8, 8), np.float32)
     density[0, 3:5, 2, 1:6] = 50  # D, H, W
@@ -75,7 +75,6 @@ def test_one_empty_voxel_surrounds_the_dense_ones_and_no_more_is_stored(human, t
     assert boxes[2] == ((3, 3, 3), (3, 3, 3))  # an empty primitive
 
 
-@pytest.mark.any_blender
 def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
     files = written(grids, tmp_path / "h")
     for k, path in enumerate(files):
@@ -85,13 +84,11 @@ def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
         np.testing.assert_allclose(transform.indexToWorld((7, 7, 7)), half, atol=1e-7)
 
 
-@pytest.mark.any_blender
 def test_density_beyond_half_precision_is_clamped_not_infinite(human):
     baked = bake(human["density"] * 1e6, human["rgb"], human["half_extent"])
     assert np.isfinite(baked.density).all()
 
 
-@pytest.mark.any_blender
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("disk full")])
 def test_a_volume_appears_whole_or_not_at_all(grids, tmp_path, monkeypatch, error):
     (path, *_), before = written(grids, tmp_path / "h"), sorted((tmp_path / "h").iterdir())
