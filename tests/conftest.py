@@ -31,6 +31,7 @@ install_import_hook(CHECKED, "beartype.beartype")
 
 
 def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
     if os.name == "nt":
         for item in items:
             if item.get_closest_marker("unix"):

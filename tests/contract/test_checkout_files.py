@@ -91,7 +91,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
     ("script", "options", "files"),
     [
         ("generate_pose_render.py", ["--size", "48"], {"yaw_000.png", "yaw_270.png", "person.human.safetensors"}),
-        ("fit_boxes.py", ["--size", "32", "--steps", "4"], {"fit.png", "gradients.png", "linear_solve.png"}),
+        ("fit_boxes.py", ["--size", "16", "--steps", "2"], {"fit.png", "gradients.png", "linear_solve.png"}),
         ("drive_the_child.py", ["--steps", "2"], {"person.human.safetensors", "front.png"}),
     ],
 )

@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import subprocess
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,22 +18,28 @@ pytestmark = pytest.mark.any_blender
 CASES = 12
 
 
-def made(folder: Path, kind: str) -> SimpleNamespace:
-    folder.mkdir()
-    command = [PYTHON, str(ROOT / "tests/blender/boxes_oracle.py"), str(folder), str(CASES), kind]
-    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT / "backend")}, check=True)
-    with np.load(folder / "cases.npz") as cases:
-        return SimpleNamespace(file=folder / "person.human.safetensors", kind=kind, cases=dict(cases))
-
-
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("boxes") / "default", "default")
+def made(tmp_path_factory) -> dict[str, SimpleNamespace]:
+    """A human of the default body and one of their own, and where the backend puts their boxes."""
+    root = tmp_path_factory.mktemp("boxes")
+    command = [PYTHON, str(ROOT / "tests/blender/boxes_oracle.py"), str(root), str(CASES)]
+    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT / "backend")}, check=True)
+    found = {}
+    for kind in ("default", "own"):
+        with np.load(root / kind / "cases.npz") as cases:
+            file = root / kind / "person.human.safetensors"
+            found[kind] = SimpleNamespace(file=file, kind=kind, cases=dict(cases))
+    return found
 
 
-@pytest.fixture(scope="module", params=["default", "own"])
-def person(request, plain, tmp_path_factory):
-    return plain if request.param == "default" else made(tmp_path_factory.mktemp("boxes") / "own", "own")
+@pytest.fixture
+def plain(made):
+    return made["default"]
+
+
+@pytest.fixture(params=["default", "own"])
+def person(request, made):
+    return made[request.param]
 
 
 def posed(person, case: int = 0, **changes) -> PosedHuman:

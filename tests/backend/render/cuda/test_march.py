@@ -29,6 +29,7 @@ def run_cases(chosen: str, **environment: str) -> None:
 
 
 @with_triton
+@pytest.mark.long
 @pytest.mark.parametrize(
     "chosen", ["overlapping or inside_boxes or one_pixel", pytest.param("", marks=pytest.mark.slow)]
 )
