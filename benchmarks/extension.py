@@ -119,7 +119,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
 
     motion = _amass_file(arguments.folder / "amass.npz")
     start = time.perf_counter()
-    bpy.ops.primdiffusion.import_motion(filepath=str(motion), timing="SOURCE")
+    bpy.ops.primdiffusion.import_motion(filepath=str(motion))
     keyed = time.perf_counter() - start
     figures: dict[str, float | None] = {
         "build_seconds": built,

@@ -13,7 +13,6 @@ from ..backend.requests import sentence
 from ..formats.poses.files import read_motion, write_amass
 from ..formats.poses.motion import Motion
 from ..motion.placing import FACTS, Placement, extend_range, place_motion, rounds_of, sample_motion, scene_fps
-from ..scene.actions import action_curves
 from ..scene.blend_values import as_shown, stored_record
 from .drawing import draw_lines
 from .export_operators import destination
@@ -52,7 +51,7 @@ class PRIMDIFFUSION_OT_add_motion(ArmatureOperator, WhereTo, bpy.types.Operator)
         seconds = (len(motion) - 1) / motion.fps / self.speed
         frames = max(1, round(seconds * scene_fps(context.scene)))  # whole, for a loop's end to be its beginning
         motion = dataclasses.replace(motion, fps=(len(motion) - 1) / frames * scene_fps(context.scene))
-        how = Placement(start=self.start, root=self.root, ground=False, into=self.into)
+        how = Placement(start=self.start, root=self.root, ground=False)
         _, last = place_motion(context, armature, motion, how)
         if self.extend:
             extend_range(context.scene, last)
@@ -112,8 +111,6 @@ def _draw_action(layout: bpy.types.UILayout, armature: bpy.types.Object) -> None
         row = box.split(factor=0.4)
         row.label(text=label)
         row.label(text=text, translate=False)
-    if action_curves(armature) is not None:
-        layout.prop(armature.primdiffusion_human, "loop")
 
 
 def facts_of(action: bpy.types.Action) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The section Shape of the panel Human; the human's shape and loop are properties of the armature, applied at once."""
+"""The section Shape of the panel Human; the human's shape is a property of the armature, applied at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..files.regular_files import printable
-from ..scene.actions import action_curves, end_repeat, loops, repeat
+from ..scene.actions import action_curves
 from ..scene.edit import check_shapeable, reshape
 from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human, selected_person
 from ..scene.human_file import shape_model_of
@@ -96,17 +96,6 @@ def _log_errors(change) -> None:
         print(printable(f"PrimDiffusion: {error}"))
 
 
-def _looped(self: PRIMDIFFUSION_PG_human) -> bool:
-    return action_curves(self.id_data) is not None and loops(self.id_data)
-
-
-def _loop(self: PRIMDIFFUSION_PG_human, looped: bool) -> None:
-    if action_curves(self.id_data) is None:
-        print(f"PrimDiffusion: {self.id_data.name!r} has no action to loop: import or add a motion first")
-    elif looped != loops(self.id_data):
-        (repeat if looped else end_repeat)(self.id_data)
-
-
 class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
@@ -149,13 +138,6 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
         options=_NOT_ANIMATED,
         get=_weight,
         set=_set_weight,
-    )
-    loop: bpy.props.BoolProperty(
-        name="Loop",
-        description="Loop the motion; a walk continues from where it has arrived",
-        options=_NOT_ANIMATED,
-        get=_looped,
-        set=_loop,
     )
 
 
