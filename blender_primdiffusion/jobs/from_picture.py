@@ -98,7 +98,7 @@ class PictureTask:
             posture = {"format": POSTURE_FORMAT, **self.posed, "cameras": self.cameras}
             (folder / "start.json").write_text(json.dumps(posture), encoding="utf-8")
             params["pose"] = str(folder / "start.json")
-        checkpoint = chosen_checkpoint("checkpoint")
+        checkpoint = chosen_checkpoint()
         return {**params, **({"checkpoint": checkpoint} if checkpoint else {}), "out_dir": str(folder / "fitted")}
 
     def camera_now(self) -> bpy.types.Object | None:

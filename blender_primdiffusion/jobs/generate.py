@@ -1,4 +1,4 @@
-"""Jobs that add a new human to the scene, from noise or from captures, and edits, which change one in place."""
+"""Jobs that generate a human, and edits, which change one in place."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from mathutils import Matrix, Vector
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
-from ..formats.requests import ReconstructRequest
 from ..scene.build import build_human
 from ..scene.edit import Replaced, replace_person, select_human
 from ..scene.human import HumanTarget, humans, session_file
@@ -90,7 +89,7 @@ class GenerateJob(Job):
     seed: int
     sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Other fields of `GenerateRequest`: steps, sampler, attributes, guidance."""
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+    checkpoint: str = dataclasses.field(default_factory=chosen_checkpoint)
     next_seed: int | None = None
     """What the panel's seed becomes with this human; None where it was not used, or is locked."""
 
@@ -108,35 +107,6 @@ class GenerateJob(Job):
         if self.next_seed is not None:
             context.scene.primdiffusion.seed = self.next_seed
         return notice
-
-
-@dataclasses.dataclass(frozen=True)
-class ReconstructJob(Job):
-    """Human from Captures."""
-
-    kind = method = "reconstruct"
-    undo = "Human from Captures"
-
-    capture: str
-    """Folder of a dataset of captures, or of one subject in it."""
-    subject: str
-    """Empty for the only one."""
-    frame: int
-    views: int
-    by: str = ReconstructRequest.by
-
-    @property
-    def label(self) -> str:
-        return f"Human from Captures, {self.subject or Path(self.capture).name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        params: dict[str, Any] = {"capture": self.capture, "frame": self.frame, "views": self.views, "by": self.by}
-        checkpoint = chosen_checkpoint("encoder" if self.by == "encoder" else "checkpoint")
-        optional = {"subject": self.subject, "checkpoint": checkpoint}
-        return {**params, **{k: v for k, v in optional.items() if v}, "out_dir": str(folder)}
-
-    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
-        return build_person(context, result, "Reconstructed")[1]
 
 
 def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: HumanAnswer) -> Replaced:
@@ -167,7 +137,7 @@ class EditJob(Job):
     target: HumanTarget
     asked: Mapping[str, Any]
     """Fields of the request. A region {"painted": [V numbers]} holds weights, and travels as a file."""
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+    checkpoint: str = dataclasses.field(default_factory=chosen_checkpoint)
 
     @classmethod
     def of(cls, method: str, person: bpy.types.Object, asked: Mapping[str, Any]) -> EditJob:

@@ -65,14 +65,14 @@ class Job(abc.ABC):
         return False
 
 
-def chosen_checkpoint(name: str) -> str:
-    """The file of the preference `checkpoint` or `encoder`; empty for the bundled one.
+def chosen_checkpoint() -> str:
+    """The file of the preference `checkpoint`; empty for the bundled one.
 
     Raises ValueError for a path that depends on the open .blend or the working directory.
     """
-    chosen = preference(name)
+    chosen = preference("checkpoint")
     if chosen and not is_local_path(chosen):
-        raise ValueError(NOT_ABSOLUTE.format(f"a {name}", chosen[:200]))
+        raise ValueError(NOT_ABSOLUTE.format("a checkpoint", chosen[:200]))
     return chosen
 
 

@@ -47,7 +47,7 @@ _REMEDIES = {
     "file_system": _SAVE_AS,
 }
 """By the kind of error."""
-_PREFERENCE_ERRORS = re.compile("checkpoint|encoder|safetensors")
+_PREFERENCE_ERRORS = re.compile("checkpoint|safetensors")
 """Other missing files, such as captures, are chosen in their panels."""
 
 

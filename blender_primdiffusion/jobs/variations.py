@@ -102,7 +102,7 @@ class VariationsJob(Job):
     """File of the human to vary; empty for new humans."""
     amount: float = 0.5
     title: str = "New humans"
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+    checkpoint: str = dataclasses.field(default_factory=chosen_checkpoint)
 
     @property
     def label(self) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from .build import STAND_IN
 from .human import BODY_MARK, PROXY_MARK, humans
 
 GAP_M = 0.2
@@ -28,7 +27,7 @@ _STEP_M = 0.1
 """Height above the soles of what one stands on: floors, rugs, uneven ground, metres."""
 _SEE_THROUGH = frozenset({"WIRE", "BOUNDS"})
 _SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
-_OF_HUMANS = (BODY_MARK, PROXY_MARK, STAND_IN)
+_OF_HUMANS = (BODY_MARK, PROXY_MARK)
 
 
 def stand_at_cursor(context: bpy.types.Context, person: bpy.types.Object) -> None:

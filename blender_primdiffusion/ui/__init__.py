@@ -13,7 +13,6 @@ from types import ModuleType
 import bpy
 
 from ..jobs import follow, parts, volumes, windows
-from ..scene import build
 from . import (
     advanced_panel,
     captures_panel,
@@ -32,7 +31,6 @@ from . import (
     picture_panel,
     pose_panel,
     preferences,
-    reconstruct_panel,
     render_panel,
     shape_panel,
     variations_panel,
@@ -44,7 +42,7 @@ MODULES = (
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
     volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, export_panel, advanced_panel, captures_settings,
-    captures_panel, reconstruct_panel, viewport_humans, manual, menus, build,
+    captures_panel, viewport_humans, manual, menus,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

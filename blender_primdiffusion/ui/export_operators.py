@@ -24,7 +24,6 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.queue import Job
 from ..scene.armature import check_joints
 from ..scene.human import HumanTarget
-from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from .declared import SKIP, declared
 from .drawing import property_columns
 from .menus import FOLDER
@@ -81,7 +80,7 @@ ENDINGS = {
 """File extensions by format; the first is the default."""
 _OF_MESHES = ("texture_px", "triangles", "animation")
 OPTIONS = {
-    "HUMAN": ("motion", "compact"),
+    "HUMAN": (),
     "GLB": _OF_MESHES,
     "FBX": _OF_MESHES,
     "USD": _OF_MESHES,
@@ -117,16 +116,6 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
         precision=3,
         step=0.1,
         subtype="DISTANCE",
-    )
-    motion: bpy.props.BoolProperty(
-        name="With Motion",
-        description="Include the motion of the scene's frame range in the .human file; otherwise only the human",
-        default=False,
-    )
-    compact: bpy.props.BoolProperty(
-        name="Compact",
-        description="Store colours and densities of the .human file in 8 bits: 2 MB instead of 8, without visible loss",
-        default=False,
     )
 
 
@@ -173,15 +162,10 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         kind = by_ending or context.scene.primdiffusion_export.format
         path = destination(self.filepath, ENDINGS[kind])
         if kind == "HUMAN":
-            return self._write_human(context, person, path)
+            write_human(person, path)
+            self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+            return {"FINISHED"}
         return submit(self, context, self._job(context, person, kind, path))
-
-    def _write_human(self, context: bpy.types.Context, person: bpy.types.Object, path: Path) -> set[str]:
-        settings = context.scene.primdiffusion_export
-        frames = scene_frames(context.scene, True) if settings.motion else None
-        write_human(context, person, path, frames, compact=settings.compact)
-        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
-        return {"FINISHED"}
 
     def _job(self, context: bpy.types.Context, person: bpy.types.Object, kind: str, path: Path) -> Job:
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
@@ -241,7 +225,6 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         path = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not path.is_file():
             raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
-        motion_in(read_tensors(path, CHOOSE_ANOTHER), path.name)
         at = tuple(self.location) if self.given("location") else None
         return submit(self, context, ImportHumanJob(str(path), at))
 

@@ -1,37 +1,23 @@
-"""The sidebar panel Export, with the operator that makes assets; .human files, imported or dropped onto the 3D view."""
+"""The sidebar panel Export; .human files, imported or dropped onto the 3D view."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..backend.requests import sentence
-from ..jobs.export import HumanAssetJob
-from ..jobs.follow import submit
 from ..places import backend_is_named
-from ..scene.human import HumanTarget, humans, proxy_of, selected_person
+from ..scene.human import proxy_of, selected_person
 from ..scene.proxy import is_outdated
 from .advanced_panel import draw_representations
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_operators import OPTIONS
 from .menus import draw_samples
-from .on_person import HumanOperator
 
 _JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
 """Kinds of jobs by format; a .human file needs none, the others are meshes."""
 
 
-class PRIMDIFFUSION_OT_mark_as_asset(HumanOperator, bpy.types.Operator):
-    """Mark the selected human as an asset with a preview, to drag from the Asset Browser into any file"""
-
-    bl_idname = "primdiffusion.mark_as_asset"
-    bl_label = "Mark Human as Asset"
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        return submit(self, context, HumanAssetJob(HumanTarget.of(person)))
-
-
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
-    """The selected human as a file, as a mesh proxy, as an asset."""
+    """The selected human as a file, as a mesh proxy."""
 
     bl_label = "Export"
     bl_order = 3
@@ -53,8 +39,6 @@ class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
             return
         if (body := draw_section(layout, "proxy", text="Mesh Proxy", page="export", section="mesh-proxy")) is not None:
             _draw_proxy(body, context)
-        if (body := draw_section(layout, "assets", text="Assets", page="assets")) is not None:
-            _draw_assets(body, context)
 
 
 def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -90,21 +74,6 @@ def draw_as_mesh(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH", text="As Mesh")
     else:
         draw_representations(layout, person)
-
-
-def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Humans for other files."""
-    try:
-        person = selected_person(context) if humans(context.scene) else None
-    except ValueError as error:
-        draw_lines(layout, sentence(error), "INFO")
-        return
-    if person is not None and person.asset_data is not None:
-        row = layout.row()
-        row.context_pointer_set("id", person)
-        row.operator("asset.clear_single", text="Unmark Human Asset", icon="X")
-    else:
-        draw_job(layout, "human_asset", "primdiffusion.mark_as_asset", "ASSET_MANAGER")
 
 
 def draw_from_file(layout: bpy.types.UILayout) -> None:

@@ -137,11 +137,6 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="Diffusion model, a .safetensors file; empty: the bundled one",
         subtype="FILE_PATH",
     )
-    encoder: bpy.props.StringProperty(
-        name="Encoder",
-        description="Encoder for humans from captures, a .safetensors file; empty: the bundled one",
-        subtype="FILE_PATH",
-    )
     idle_minutes: bpy.props.IntProperty(
         name="Release Memory After (min)",
         description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
@@ -152,7 +147,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
     )
     captures: bpy.props.BoolProperty(
         name="Captures",
-        description=f"Show the tab {DATA} in the sidebar: training data from scans, and humans from images",
+        description=f"Show the tab {DATA} in the sidebar: training data from scans",
         update=_captures_changed,
     )
 
@@ -161,7 +156,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         _draw_backend(self, layout.box())
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "captures"):
+        for name in ("backend_python", "checkpoint", "idle_minutes", "captures"):
             layout.prop(self, name)
 
 

@@ -148,7 +148,7 @@ def variations(module: str, python: str) -> Steps:
 
 
 def human(module: str, python: str) -> Steps:
-    """Shape before and after, facts, poses, assets."""
+    """Shape before and after, facts, poses."""
     yield from with_people(module, python, FIRST_SEED)
     armature = armatures()[0]
     yield from show("PRIMDIFFUSION_PT_human/shape")
@@ -173,8 +173,6 @@ def human(module: str, python: str) -> Steps:
     yield from at_rest(module)
     yield "human_poses"
     press("object.posemode_toggle")
-    yield from show("PRIMDIFFUSION_PT_export/assets")
-    yield "human_assets"
 
 
 def edits(module: str, python: str) -> Steps:
@@ -272,11 +270,6 @@ def captures(module: str, python: str) -> Steps:
     settings.light, settings.hdri, settings.background = "hdri", str(Path(tempfile.gettempdir()) / "skies"), "hdri"
     yield from show(*(f"PRIMDIFFUSION_PT_captures/captures_{name}" for name in ("input", "cycles", "output")))
     yield "captures_output"
-    yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_human_from_captures")
-    bpy.context.scene.primdiffusion_reconstruct.capture = "/nowhere/captures"
-    press("primdiffusion.human_from_captures")
-    yield from wait(lambda: not queue_of(module).busy, 60)
-    yield "captures_human"
 
 
 def export(module: str, python: str) -> Steps:

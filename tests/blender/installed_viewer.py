@@ -55,7 +55,6 @@ report["reshaped"] = sorted(press.reshape(betas=[2.0] + [0.0] * 9))
 reshaped = centres()
 report["moved"] = [float(np.abs(after - before).max()) for before, after in ((rest, posed), (posed, reshaped))]
 file = folder / "again.human"
-bpy.context.scene.primdiffusion_export.compact = True
 report["exported"] = sorted(press.export(filepath=str(file)))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))

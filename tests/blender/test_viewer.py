@@ -106,7 +106,7 @@ def test_a_human_of_the_gallery_is_added_posed_and_reshaped_without_a_backend(us
     assert report["volumes"] == 1024
 
 
-def test_its_export_is_compact_and_comes_back(used):
+def test_its_export_is_as_small_and_comes_back(used):
     report, folder = used
     assert (report["exported"], report["imported"], report["humans"]) == (["FINISHED"], ["FINISHED"], 2)
     assert report["bytes"] < build_addon.LARGEST_IN_GALLERY

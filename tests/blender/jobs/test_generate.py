@@ -35,7 +35,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
     addon.scene.primdiffusion.steps = 3
     assert bpy.ops.primdiffusion.generate(seed=7) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    assert len(parts_of(person)) == 4
+    assert len(parts_of(person)) == 3
     sent = request_of(person_file(person))
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
     assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "guidance": 2.0, "size": 16, "picture_px": 256}

@@ -131,7 +131,7 @@ def test_blenders_own_duplicate_of_all_parts(person):
         obj.hide_viewport = False
         obj.select_set(True)
     bpy.ops.object.duplicate()
-    assert len(bpy.context.selected_objects) == 3  # all but what stands in without the extension
+    assert len(bpy.context.selected_objects) == 3
     bpy.data.batch_remove([obj for obj in bpy.context.selected_objects])
     assert whole(person, where)
 
