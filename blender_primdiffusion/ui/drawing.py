@@ -15,8 +15,8 @@ from ..jobs.windows import icons
 from ..places import backend_is_named
 from .manual import draw_manual_button
 
-MAIN, DATA = "PrimDiffusion", "PrimDiffusion Data"
-"""Tabs of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
+MAIN = "PrimDiffusion"
+"""Tab of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
 _LINE = 34
 """Characters that fit a sidebar of default width, beside an icon."""
 _QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
@@ -26,7 +26,7 @@ _MINUTES_FROM_S = 90.0
 
 
 class SidebarPanel:
-    """A panel in the sidebar. Blender orders tabs as it orders their first panels."""
+    """A panel in the sidebar."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"

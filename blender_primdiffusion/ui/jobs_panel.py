@@ -8,7 +8,7 @@ from bpy.app.handlers import persistent
 from ..jobs import follow
 from ..jobs.follow import Reporting, device_line, redraw
 from ..jobs.queue import queue
-from .captures_settings import captures
+from .captures_panel import captures
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
 from .preferences import cancel_set_up

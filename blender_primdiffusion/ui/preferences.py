@@ -12,7 +12,7 @@ from ..backend.requests import sentence
 from ..jobs.follow import redraw
 from ..jobs.queue import queue
 from ..places import EXTENSION, INSTALLS_BACKEND, installed_backend, preference, set_up_folder
-from .drawing import DATA, draw_lines
+from .drawing import draw_lines
 
 if INSTALLS_BACKEND:
     from . import setup
@@ -147,7 +147,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
     )
     captures: bpy.props.BoolProperty(
         name="Captures",
-        description=f"Show the tab {DATA} in the sidebar: training data from scans",
+        description="Show the panel Captures in the sidebar: training data from scans",
         update=_captures_changed,
     )
 

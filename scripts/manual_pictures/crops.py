@@ -20,7 +20,7 @@ PANELS = {
     "edits": ("edit_parts", "edit_two_people"),
     "motion": ("motion_empty", "motion_imported"),
     "render": ("render_cycles", "render_merged", "render_outdated"),
-    "captures": ("captures_cameras", "captures_output"),
+    "captures": ("captures_settings",),
     "export": ("export_before", "export_proxy"),
 }
 """Rows of sidebars, cropped to their panels."""

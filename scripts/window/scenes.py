@@ -254,22 +254,16 @@ def render(module: str, python: str) -> Steps:
 
 
 def captures(module: str, python: str) -> Steps:
-    """Render Captures with its cameras, Human from Captures."""
+    """Render Captures with its settings."""
     yield from begin(module, python)
     bpy.context.preferences.addons[module].preferences.captures = True
-    yield from show("PRIMDIFFUSION_PT_captures/captures_cameras", "PRIMDIFFUSION_PT_captures/captures_poses")
+    yield from show("PRIMDIFFUSION_PT_captures")
     for name in ("people", "out"):
         folder = Path(tempfile.gettempdir()) / "shots" / {"people": "scans", "out": "captures"}[name]
         folder.mkdir(exist_ok=True, parents=True)
         setattr(bpy.context.scene.primdiffusion_captures, name, str(folder))
-    press("primdiffusion.preview_rig")
     yield 1.0
-    yield "captures_cameras"
-    press("primdiffusion.preview_rig")
-    settings = bpy.context.scene.primdiffusion_captures
-    settings.light, settings.hdri, settings.background = "hdri", str(Path(tempfile.gettempdir()) / "skies"), "hdri"
-    yield from show(*(f"PRIMDIFFUSION_PT_captures/captures_{name}" for name in ("input", "cycles", "output")))
-    yield "captures_output"
+    yield "captures_settings"
 
 
 def export(module: str, python: str) -> Steps:

@@ -41,7 +41,6 @@ from blender_primdiffusion.scene.human import (
     parts_of,
 )
 from blender_primdiffusion.scene.volume_nodes import open_humans, write_volumes
-from blender_primdiffusion.ui.drawing import DATA
 
 COUNT = 3
 """Volumes of the human."""
@@ -259,7 +258,7 @@ def panels_fault() -> str:
     """Which panel cannot be drawn, or draws what Blender cannot show; empty when all can."""
     for cls in [*sidebar.panels(), *_menus()]:
         try:
-            shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or getattr(cls, "bl_category", "") == DATA
+            shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or cls.__name__ == "PRIMDIFFUSION_PT_captures"
             if not shown:
                 continue
             texts = sidebar.draw(cls, bpy.context, opened=True).texts
@@ -277,7 +276,6 @@ def _menus() -> list[type]:
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
     ("set_representation", {"representation": "VOLUMES"}), ("reshape", {"to": "GENERATED"}),
-    ("verify_captures", {}),
     ("set_representation", {"representation": "NO_MESH"}), ("merge", {"what": "NOTHING"}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""

@@ -12,7 +12,7 @@ SETTINGS = {
     "primdiffusion": (requests.GenerateRequest, ("steps", "guidance", "seed")),
     "primdiffusion_edit": (requests.VaryRequest, ("amount", "seed")),
     "primdiffusion_export": (requests.ProxyRequest, ("triangles",)),
-    "primdiffusion_captures": (CaptureSettings, ("together", "pose_count", "samples", "seed")),
+    "primdiffusion_captures": (CaptureSettings, ("pose_count", "samples", "seed")),
 }
 
 
