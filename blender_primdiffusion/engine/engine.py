@@ -10,7 +10,7 @@ from ..backend.requests import ChildRequest
 from ..formats.requests import RAY_STEP
 from . import drawing_child
 from .drawing_child import Frame, frames
-from .picture import scene_content, solids_file
+from .picture import scene_content, scene_solids, stored
 from .view import PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
 from .who_draws import ENGINE
@@ -103,21 +103,6 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
         default="COLOUR",
         update=_redraw,
     )
-    solids: bpy.props.EnumProperty(
-        name="Solid Objects",
-        description="How meshes and other surfaces are drawn",
-        items=(
-            ("SHADED", "Shaded", "Drawn with simple shading; they hide humans behind"),
-            (
-                "HOLDOUT",
-                "Holdout",
-                "Not drawn, but they cut holes into humans, for compositing over a Cycles render",
-            ),
-            ("IGNORED", "Ignored", "Humans are drawn as if they were not there"),
-        ),
-        default="SHADED",
-        update=_redraw,
-    )
     in_viewports: bpy.props.BoolProperty(
         name="Humans",
         description="Show generated humans in 3D views as the PrimDiffusion engine draws them, wherever their volumes "
@@ -143,7 +128,7 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
     result = engine.begin_result(0, 0, width, height, layer=depsgraph.view_layer_eval.name)
     finished = False
     try:
-        picture = scene_content(depsgraph, solids_file(depsgraph, frames.folder))
+        picture = scene_content(depsgraph, stored(scene_solids(depsgraph), frames.folder))
         view = camera_view(camera, depsgraph, size, picture.subject)
         frame = frames.take(width, height)
         if not bpy.app.background:

@@ -39,13 +39,6 @@ class PinholeView:
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return dataclasses.replace(self, intrinsics=scale @ self.intrinsics, width=width, height=height)
 
-    def part(self, region: tuple[int, int, int, int]) -> PinholeView:
-        """The view of a part [x, y, width, height], pixels from the left and the bottom."""
-        x, y, width, height = region
-        intrinsics = self.intrinsics.copy()
-        intrinsics[:2, 2] -= x, self.height - y - height
-        return dataclasses.replace(self, intrinsics=intrinsics, width=width, height=height)
-
     def params(self) -> dict[str, object]:
         """Parameters of the child's `draw`."""
         return {

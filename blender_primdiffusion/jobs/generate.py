@@ -20,7 +20,6 @@ from ..scene.human import HumanTarget, humans, session_file
 from ..scene.place import stand_at_cursor
 from ..scene.representation import in_viewport, representation_of
 from ..scene.volume_nodes import set_folder
-from ..scene.volumes import free_unused_grids
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .volumes import write_or_report
 
@@ -115,8 +114,6 @@ def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: 
     if representation_of(person) == "VOLUMES" and in_viewport(person):
         write_or_report(person)
         set_folder(person, session_file(person).parent, again=True)
-        context.view_layer.update()  # evaluated data holds the old grids
-        free_unused_grids()
     return done
 
 

@@ -41,7 +41,6 @@ _REMEDIES = {
     "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT")
     if INSTALLS_BACKEND
     else _PREFERENCES,
-    "out_of_memory": Remedy("primdiffusion.cancel", "Release Memory", "MEMORY", {"what": "MEMORY"}),
     "missing_file": _PREFERENCES,  # a checkpoint's path
     "unwritable": _SAVE_AS,
     "file_system": _SAVE_AS,

@@ -134,16 +134,6 @@ def draw_queue(layout: bpy.types.UILayout) -> None:
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
 
 
-def draw_ended(layout: bpy.types.UILayout) -> None:
-    """The last jobs that ended, and how; messages are shown below their buttons."""
-    if not queue.ended:
-        return
-    column = layout.column(align=True)
-    for outcome in queue.ended:
-        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.succeeded else "CANCEL"
-        column.label(text=outcome.entry.job.label, icon=icon, translate=False)
-
-
 def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
     """The message, or the error with its remedy."""
     if outcome.error is None:

@@ -7,7 +7,7 @@ from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from ..backend.requests import sentence
-from ..jobs.follow import Reporting, device_line, submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.generate import GenerateJob
 from ..jobs.queue import queue
 from ..scene.human import humans
@@ -107,7 +107,7 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
             column.prop(settings, "sampler")
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE", reason)
         if queue.child_message:
-            draw_lines(layout, sentence(device_line()), "ERROR")
+            draw_lines(layout, sentence(f"{queue.child_message}; restarts with the next human"), "ERROR")
         if humans(context.scene) and not queue.busy:
             draw_next_step(layout, context.scene)
         if ready:

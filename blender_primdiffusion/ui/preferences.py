@@ -137,14 +137,6 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="Diffusion model, a .safetensors file; empty: the bundled one",
         subtype="FILE_PATH",
     )
-    idle_minutes: bpy.props.IntProperty(
-        name="Release Memory After (min)",
-        description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
-        "0: never",
-        default=10,
-        min=0,
-        soft_max=120,
-    )
     captures: bpy.props.BoolProperty(
         name="Captures",
         description="Show the panel Captures in the sidebar: training data from scans",
@@ -156,7 +148,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         _draw_backend(self, layout.box())
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "idle_minutes", "captures"):
+        for name in ("backend_python", "checkpoint", "captures"):
             layout.prop(self, name)
 
 

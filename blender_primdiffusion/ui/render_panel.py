@@ -54,7 +54,6 @@ class PRIMDIFFUSION_PT_marching(_OfEngine, bpy.types.Panel):
         draw_set_up(layout)
         layout.prop(settings, "view")
         layout.prop(settings, "step")
-        layout.prop(settings, "solids")
         layout.prop(context.scene.render, "film_transparent", text="Transparent")
 
 

@@ -19,9 +19,8 @@ ops = bpy.ops.primdiffusion
 
 
 def test_each_error_has_a_button_where_there_is_something_to_do(addon):
-    for kind in ("died", "hung", "busy", "timeout"):
+    for kind in ("died", "hung", "busy", "timeout", "out_of_memory"):
         assert remedies.remedy_for(RequestError("", "", kind)) is None
-    assert remedies.remedy_for(RequestError("", "", "out_of_memory")).properties == {"what": "MEMORY"}
     assert remedies.remedy_for(RequestError("", "", "unwritable")).operator == "wm.save_as_mainfile"
     no_checkpoint = RequestError("there is no checkpoint at 'x.safetensors'", "", "missing_file")
     assert remedies.remedy_for(no_checkpoint).operator == "preferences.addon_show"
@@ -34,7 +33,7 @@ def test_the_panel_shows_the_error_its_button_and_the_log(addon):
     with pytest.raises(RuntimeError):
         ops.generate(seed=NO_MEMORY)
     texts = shown(PRIMDIFFUSION_PT_generate, addon)
-    assert {"primdiffusion.cancel", "wm.path_open"} <= set(texts)
+    assert "wm.path_open" in texts
 
 
 def test_the_log_holds_versions_and_the_error(addon):

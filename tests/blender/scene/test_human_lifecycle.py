@@ -182,17 +182,6 @@ def test_the_armature_turned_and_scaled_in_a_scene_of_centimetres(person):
     assert whole(person)
 
 
-def test_memory_of_deleted_people_is_given_back_and_undo_shows_them_again(person):
-    where = places(person)
-    step("before")
-    press_x(humans(bpy.context.scene)[0])
-    step("delete")
-    bpy.ops.ed.undo()
-    assert whole(named(), where)
-    ops.cancel(what="MEMORY")
-    assert whole(named(), where)
-
-
 def test_edits_do_not_pile_up_grids(source, monkeypatch):
     npz = synthetic_shape.write(source / "large", 64)
     monkeypatch.setenv("FAKE_HUMAN", str(npz))

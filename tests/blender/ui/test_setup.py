@@ -217,7 +217,7 @@ def test_the_preferences_show_what_was_found_and_what_it_costs(wheels):
     layout = draw_preferences()
     assert re.search(r"Found: .*Python 3\.\d+", said(layout))
     assert re.search(r"Downloads \d+ MB, takes \d+ MB on disk", said(layout))
-    assert {"compute", "backend_python", "checkpoint", "idle_minutes"} <= set(layout.of("prop"))
+    assert {"compute", "backend_python", "checkpoint"} <= set(layout.of("prop"))
 
 
 def test_the_zip_holds_the_locks_and_asks_for_the_network():
