@@ -1,4 +1,4 @@
-"""Exports of humans: textured meshes, .human files, 3D Gaussians, VDB sequences; imports of .human files."""
+"""Exports of humans: textured meshes, .human files, 3D Gaussians; imports of .human files."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
-from ..files.regular_files import exists_in_its_folder, remove_file
+from ..files.regular_files import exists_in_its_folder
 from ..files.whole_files import written_whole
-from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
+from ..formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
 from ..scene.actions import posed_on
 from ..scene.armature import check_joints
 from ..scene.human import BODY_FILE, PERSON_FILE, HumanTarget, link_part, proxy_of, session_file
@@ -27,7 +27,6 @@ from ..scene.human_file import (
     shape_model_of,
     write_tensors,
 )
-from ..scene.merged import read_grid, write_grid
 from ..scene.proxy import (
     build_proxy,
     read_proxy,
@@ -169,44 +168,6 @@ class ExportGaussiansJob(Job):
         put(result.out, self.path)
         size = self.path.stat().st_size / 1e6
         return f"Exported {self.target.name} to {self.path.name}: {result.gaussians} Gaussians, {size:.1f} MB"
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportVdbSequenceJob(Job):
-    """Write a human as one grid for each frame, in world space."""
-
-    kind = "export_vdb_sequence"
-    method = "merge_frames"
-
-    target: HumanTarget
-    folder: Path
-    stem: str
-    people: list[dict[str, Any]]
-    """Parameters of `draw`, an entry for each frame."""
-    first: int
-    """The first frame's number."""
-    voxel: float
-
-    @property
-    def label(self) -> str:
-        return f"Export {len(self.people)} VDB files of {self.target.name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        file = self.target.file_now()
-        people = [{**person, "human": file} for person in self.people]
-        return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
-
-    def finish(self, _context: bpy.types.Context, result: MergeFramesAnswer, folder: Path) -> str:
-        written = []
-        for index, grid in enumerate(result.files):
-            name = f"{self.stem}_{self.first + index:04d}.vdb"
-            write_grid(read_grid(grid), folder / name)
-            remove_file(grid, grid.parent)
-            written.append(folder / name)
-        size = sum(path.stat().st_size for path in written) / 1e6
-        for path in written:
-            put(path, self.folder / path.name)
-        return f"Exported {len(written)} frames of {self.target.name} to {self.folder.name}: {size:.0f} MB"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
@@ -22,9 +21,6 @@ from ..scene.representation import in_viewport, representation_of
 from ..scene.volume_nodes import set_folder
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .volumes import write_or_report
-
-FIRST_HUMAN_SHARE = 0.25
-"""Of a view's height: a scene's first human is framed where no view shows it taller."""
 
 
 def build_person(
@@ -39,39 +35,29 @@ def build_person(
     stand_at_cursor(context, person)
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, person)
-        bring_into_view(person, 0.0 if len(humans(context.scene)) > 1 else FIRST_HUMAN_SHARE)
+        if len(humans(context.scene)) == 1:
+            frame_in_view()
     notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
     return person, " ".join([sentence(notice), *map(sentence, result.warnings)])
 
 
-def bring_into_view(obj: bpy.types.Object, least: float) -> None:
-    """Have the first 3D view frame a selected object, unless a view shows all of it on more than the share `least` of
-    its height, or looks through a camera."""
+def frame_in_view() -> None:
+    """Have the first 3D view frame what is selected, unless a view looks through a camera."""
     if bpy.app.background:
         return
     bpy.context.view_layer.update()
     views = [
-        (window, area, area.spaces.active.region_3d)
+        (window, area)
         for window in bpy.context.window_manager.windows
         for area in window.screen.areas
         if area.type == "VIEW_3D" and area.spaces.active.local_view is None
     ]
-    if not views or any(around.view_perspective == "CAMERA" for *_, around in views):
+    if not views or any(area.spaces.active.region_3d.view_perspective == "CAMERA" for _, area in views):
         return
-    if not any(share_of_height(around.perspective_matrix, obj) > least for *_, around in views):
-        window, area, _ = views[0]
-        region = next(region for region in area.regions if region.type == "WINDOW")
-        with bpy.context.temp_override(window=window, area=area, region=region):
-            bpy.ops.view3d.view_selected()
-
-
-def share_of_height(perspective: Matrix, obj: bpy.types.Object) -> float:
-    """The share of a view's height that an object's bounding box takes; 0 where the view does not show all of it."""
-    clip = [perspective @ (obj.matrix_world @ Vector(corner)).to_4d() for corner in obj.bound_box]
-    if min(corner.w for corner in clip) <= 0:
-        return 0.0
-    seen = np.array([(corner.x / corner.w, corner.y / corner.w) for corner in clip])
-    return 0.0 if np.abs(seen).max() > 1 else float(np.ptp(seen[:, 1])) / 2
+    window, area = views[0]
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.view3d.view_selected()
 
 
 _STEP_PICTURE_PX = 256

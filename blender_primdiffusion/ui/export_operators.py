@@ -9,12 +9,11 @@ from pathlib import Path
 import bpy
 
 from ..backend.requests import error_text
-from ..formats.requests import GaussiansRequest, MergeFramesRequest, ProxyRequest
+from ..formats.requests import GaussiansRequest, ProxyRequest
 from ..jobs.export import (
     AddProxyJob,
     ExportGaussiansJob,
     ExportMeshJob,
-    ExportVdbSequenceJob,
     ImportHumanJob,
     posed_frames,
     scene_frames,
@@ -67,7 +66,6 @@ FORMATS = (
     ("FBX", "FBX", "A textured mesh in one .fbx file", 1),
     ("USD", "USD", "A textured mesh: a .usd file with its texture beside it, or one .usdz file", 2),
     ("PLY", "Gaussians", "3D Gaussians of the current pose in a .ply file, for splat viewers", 4),
-    ("VDB", "VDB Sequence", "A volume for each frame of the scene, for any renderer that reads OpenVDB", 5),
 )
 ENDINGS = {
     "HUMAN": (".human", ".safetensors"),
@@ -75,7 +73,6 @@ ENDINGS = {
     "FBX": (".fbx",),
     "USD": (".usdc", ".usda", ".usd", ".usdz"),
     "PLY": (".ply",),
-    "VDB": (".vdb",),
 }
 """File extensions by format; the first is the default."""
 _OF_MESHES = ("texture_px", "triangles", "animation")
@@ -85,7 +82,6 @@ OPTIONS = {
     "FBX": _OF_MESHES,
     "USD": _OF_MESHES,
     "PLY": ("gaussians",),
-    "VDB": ("voxel",),
 }
 """Settings of each format."""
 
@@ -107,20 +103,10 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
     triangles: declared(ProxyRequest, "triangles")
     gaussians: declared(GaussiansRequest, "limit", name="Gaussians")
-    voxel: bpy.props.FloatProperty(
-        name="Voxel Size",
-        description="Voxel size of the VDB sequence: half the size takes eight times the memory",
-        default=MergeFramesRequest.voxel,
-        min=0.002,
-        max=0.05,
-        precision=3,
-        step=0.1,
-        subtype="DISTANCE",
-    )
 
 
 class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
-    """Export the selected human: for another scene, as a textured mesh, as Gaussians, as volumes"""
+    """Export the selected human: for another scene, as a textured mesh, as Gaussians"""
 
     bl_idname = "primdiffusion.export"
     bl_label = "Export Human"
@@ -168,14 +154,11 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         return submit(self, context, self._job(context, person, kind, path))
 
     def _job(self, context: bpy.types.Context, person: bpy.types.Object, kind: str, path: Path) -> Job:
-        """What writes a mesh, Gaussians or volumes. Raises ValueError."""
+        """What writes a mesh or Gaussians. Raises ValueError."""
         target, scene, settings = HumanTarget.of(person), context.scene, context.scene.primdiffusion_export
         if kind == "PLY":
             (now,) = posed_frames(context, person, [scene.frame_current])
             return ExportGaussiansJob(target, path, now, settings.gaussians)
-        if kind == "VDB":
-            people = posed_frames(context, person, range(scene.frame_start, scene.frame_end + 1))
-            return ExportVdbSequenceJob(target, path.parent, path.stem, people, scene.frame_start, settings.voxel)
         check_joints(person)
         frames = scene_frames(scene, settings.animation)
         return ExportMeshJob(target, int(settings.texture_px), settings.triangles, path, kind, frames)

@@ -12,9 +12,6 @@ from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_
 from .export_operators import OPTIONS
 from .menus import draw_samples
 
-_JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
-"""Kinds of jobs by format; a .human file needs none, the others are meshes."""
-
 
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
     """The selected human as a file, as a mesh proxy."""
@@ -34,7 +31,7 @@ class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
         if kind == "HUMAN":
             layout.operator("primdiffusion.export", icon="EXPORT")
         else:
-            draw_job(layout, _JOBS.get(settings.format, "export_mesh"), "primdiffusion.export", "EXPORT")
+            draw_job(layout, "export_gaussians" if kind == "PLY" else "export_mesh", "primdiffusion.export", "EXPORT")
         if not backend_is_named():
             return
         if (body := draw_section(layout, "proxy", text="Mesh Proxy", page="export", section="mesh-proxy")) is not None:

@@ -9,7 +9,7 @@ import bpy
 from ..places import EXTENSION, backend_is_named
 from .preferences import known
 
-_IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply, .vdb)"
+_IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply)"
 FOLDER = Path(__file__).resolve().parents[1] / "gallery"
 
 

@@ -24,12 +24,11 @@ _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
 _FARTHEST = 3.0
 _SHAPES = (
-    ("GIVEN", "Parameters", "Shape parameters, or a height and a weight"),
     ("RANDOM", "Random", "Give the selected human a random body shape; the same seed gives the same shape"),
     ("GENERATED", "As Generated", "Reset the selected human to the shape of the last edit, or of generation"),
     ("OTHER", "Other Human", "Copy the body shape of the other human to the selected human"),
 )
-_SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ()}
+_SETTINGS = {"RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ()}
 """Properties of the operator that matter, by shape."""
 
 
@@ -142,7 +141,7 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
 
 
 class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
-    """Set the body shape of the selected human: by numbers, at random, as generated, or as another human's"""
+    """Set the body shape of the selected human: at random, as generated, or as another human's"""
 
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
@@ -150,14 +149,6 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
     described_by = ("to",)
 
     to: bpy.props.EnumProperty(name="Reshape To", description="Which shape", items=_SHAPES, options=SKIP)
-    betas: bpy.props.FloatVectorProperty(
-        name="Shape",
-        size=BETA_COUNT,
-        description="Shape parameters in standard deviations. Not given: unchanged",
-        options=SKIP,
-    )
-    height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options=SKIP)
-    weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options=SKIP)
     seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another body", min=0, options=SKIP)
     spread: bpy.props.FloatProperty(
         name="Spread",
@@ -189,12 +180,8 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
             return generated_betas(person)
         if self.to == "OTHER":
             return self._betas_of_other(context, person)
-        if self.to == "RANDOM":
-            drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
-            return np.clip(drawn, -_FARTHEST, _FARTHEST)
-        betas = np.array(self.betas) if self.given("betas") else betas_of(person)
-        height, weight = (getattr(self, name) if self.given(name) else None for name in ("height", "weight"))
-        return betas_of_measures(shape_model_of(person), betas, height, weight)
+        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
+        return np.clip(drawn, -_FARTHEST, _FARTHEST)
 
     def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
         other = other_human(context, person)
@@ -220,9 +207,6 @@ def draw_shape(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings = person.primdiffusion_human
     layout.prop(settings, "height")
     layout.prop(settings, "weight")
-    shown = in_the_scene(context.scene, person, settings.height)
-    if shown:
-        layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
     _draw_sliders(layout, settings, {index: name for index, name in enumerate(names) if not name.isdecimal()})
     row = layout.row(align=True)
     row.operator("primdiffusion.reshape", text="Random", icon="FILE_REFRESH").to = "RANDOM"
@@ -243,17 +227,6 @@ def _draw_sliders(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup,
     column = layout.column(align=True) if names else layout  # an empty column leaves a gap
     for index, name in names.items():
         column.prop(settings, "betas", index=index, text=name, slider=True)
-
-
-def in_the_scene(scene: bpy.types.Scene, armature: bpy.types.Object, height: float) -> str:
-    """The height in the scene's units, with the armature's scale; empty where that is the same in metres."""
-    units, scale = scene.unit_settings, armature.matrix_world.to_scale().z
-    metric = units.system == "METRIC" and units.length_unit in ("METERS", "ADAPTIVE")
-    if metric and abs(units.scale_length * scale - 1) < 1e-4:
-        return ""
-    if units.system == "NONE":
-        return f"{height * scale:.3f} units"
-    return bpy.utils.units.to_string(units.system, "LENGTH", height * scale * units.scale_length, precision=3)
 
 
 def _animated(armature: bpy.types.Object) -> bool:

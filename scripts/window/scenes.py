@@ -131,10 +131,8 @@ def variations(module: str, python: str) -> Steps:
     """Eight in progress, the sheet, two selected."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_generate/variations")
-    bpy.context.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
-    bpy.context.scene.primdiffusion.seed = 40
     yield "variations_empty"
-    press("primdiffusion.variations")
+    press("primdiffusion.variations", seed=40)
     queue = queue_of(module)
     yield from wait(lambda: queue.request is not None and bool(queue.request.pictures), 120)
     yield 0.5
@@ -144,7 +142,6 @@ def variations(module: str, python: str) -> Steps:
     for index in (1, 5):
         bpy.context.window_manager.primdiffusion_selected[index] = True
     yield "variations_selected"
-    press("primdiffusion.variations", clear=True)
 
 
 def human(module: str, python: str) -> Steps:

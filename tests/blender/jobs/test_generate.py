@@ -54,13 +54,12 @@ def test_what_the_human_does_not_show_is_said(addon):
     assert "not show" not in " ".join(panel_texts(addon))
 
 
-def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
+def test_the_view_frames_the_first_human_alone(addon, monkeypatch):
     asked = []
-    monkeypatch.setattr(generate, "bring_into_view", lambda *given: asked.append(given))
+    monkeypatch.setattr(generate, "frame_in_view", lambda: asked.append(len(humans(bpy.context.scene))))
     for seed in (7, 8):
         bpy.ops.primdiffusion.generate(seed=seed)
-    first, second = humans(addon.scene)
-    assert asked == [(first, generate.FIRST_HUMAN_SHARE), (second, 0.0)]
+    assert asked == [1]
 
 
 @pytest.mark.any_blender

@@ -27,7 +27,7 @@ def test_undo_and_redo_across_generate_edit_reshape_and_delete(source, addon):
     ops.generate(seed=7)
     generated = places(humans(addon.scene)[0])
     ops.vary(seed=12)
-    ops.reshape(height=1.6)
+    ops.reshape(to="RANDOM", seed=3)
     step("reshape")
     reshaped = places(humans(bpy.context.scene)[0])
     press_x(humans(bpy.context.scene)[0])

@@ -168,20 +168,6 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
     assert np.array(asked["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
 
 
-def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
-    moving(anna)
-    anna.location = (2.0, 0.0, 0.0)
-    bpy.context.scene.primdiffusion_export.voxel = 0.01
-    OPERATORS.export(filepath=str(out / "Anna.vdb"))
-    assert sorted(path.name for path in out.iterdir()) == [f"Anna_{frame:04d}.vdb" for frame in (1, 2, 3)]
-    bpy.utils.expose_bundled_modules()
-    import openvdb
-
-    grids, _ = openvdb.readAll(str(out / "Anna_0002.vdb"))
-    assert {grid.name for grid in grids} == {"density", "Cd"}
-    assert grids[0].transform.indexToWorld((0, 0, 0))[0] == pytest.approx(2.0, abs=1e-6)
-
-
 def test_a_human_file_goes_out_and_comes_back_with_its_shape(anna, out):
     shape = np.linspace(-1, 1, 10)
     anna[BETAS] = shape.tolist()
@@ -231,7 +217,7 @@ class Dialog:
         ("GLB", "/a/Anna.human", "/a/Anna.glb"),
         ("USD", "/a/Anna.usdz", "/a/Anna.usdz"),
         ("HUMAN", "/a/Anna v1.2", "/a/Anna v1.2.human"),
-        ("VDB", "", ""),
+        ("PLY", "", ""),
     ],
 )
 def test_another_format_in_the_file_browser_changes_the_extension(anna, format, before, after):

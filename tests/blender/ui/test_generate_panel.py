@@ -1,9 +1,8 @@
-"""The panel Generate: seeds, counts, quality, presets, and people who stand side by side."""
+"""The panel Generate: seeds, counts, quality, and people who stand side by side."""
 
 import itertools
 import random
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -32,14 +31,6 @@ def queued_jobs(monkeypatch):
     monkeypatch.setattr(
         generate_panel, "submit", lambda _operator, context, job: queue.add(context, job) and {"FINISHED"}
     )
-
-
-@pytest.fixture
-def presets_folder(tmp_path, monkeypatch):
-    folder = Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{generate_panel.SUBDIR}", create=True))
-    for path in folder.glob("*.py"):
-        path.unlink()
-    return folder
 
 
 def seeds(context) -> list[int]:
@@ -128,22 +119,6 @@ def test_a_quality_stands_for_steps_and_sampler_and_these_name_the_quality(panel
     assert panel_settings.quality == "STANDARD"
     panel_settings.quality = "CUSTOM"
     assert (panel_settings.quality, panel_settings.steps) == ("CUSTOM", 30)
-
-
-def test_a_preset_holds_everything_but_the_seed(panel_settings, presets_folder):
-    panel_settings.quality, panel_settings.guidance, panel_settings.seed = "HIGH", 2.5, 5
-    panel_settings.attributes.use_height, panel_settings.attributes.height = True, 1.9
-    assert bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones") == {"FINISHED"}
-    (path,) = presets_folder.glob("*.py")
-    assert "seed" not in path.read_text()
-    panel_settings.quality, panel_settings.guidance, panel_settings.seed = "DRAFT", 1.0, 6
-    panel_settings.attributes.use_height = False
-    menu = generate_panel.PRIMDIFFUSION_PT_generate_presets.__name__
-    assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname=menu) == {"FINISHED"}
-    assert (panel_settings.quality, panel_settings.guidance, panel_settings.seed) == ("HIGH", 2.5, 6)
-    assert panel_settings.attributes.use_height
-    bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones", remove_name=True)
-    assert not list(presets_folder.glob("*.py"))
 
 
 def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_of_the_backend(

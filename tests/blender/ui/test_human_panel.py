@@ -84,8 +84,6 @@ def test_impossible_heights_leave_the_human_unchanged(person, capsys):
     settings(person).height = 2.9
     assert surface(person) == before
     assert "no body of this model has a height of 2.90 m" in capsys.readouterr().out
-    with refused(RuntimeError, "2.90"):
-        ops.reshape(height=2.9)
 
 
 def test_one_undo_takes_a_slider_back_and_redo_brings_it_again(person):
@@ -174,16 +172,7 @@ def test_copying_without_another_human_is_rejected(person, other, sentence):
         ops.reshape(to="OTHER")
 
 
-def test_a_script_gives_betas_and_measures(person):
-    ops.reshape(betas=TALL)
-    np.testing.assert_allclose(betas_of(person), TALL)
-    ops.reshape(height=1.7)
-    assert height(person) == pytest.approx(1.7, abs=2e-4)
-    with refused(RuntimeError, "-5 to 5"):
-        ops.reshape(betas=[9.0] * 10)
-
-
-def test_the_panels_show_height_and_provenance(person, addon):
+def test_the_panel_shows_provenance(person, addon):
     person[MARK] = json.dumps(
         {
             **json.loads(person[MARK]),
@@ -192,22 +181,10 @@ def test_the_panels_show_height_and_provenance(person, addon):
             "unfollowed": {"hair": "long"},
         }
     )
-    addon.scene.unit_settings.system = "IMPERIAL"
-    panel = " ".join(shown(draw_shape, addon))
-    assert "In the scene: " in panel
-    assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
     for text in made:
         assert text in details
-
-
-def test_a_scaled_human_shows_its_height_in_the_scene(person, addon):
-    assert "In the scene" not in " ".join(shown(draw_shape, addon))
-    person.scale = (2, 2, 2)
-    addon.view_layer.update()
-    tall = 2 * measure(shape_model_of(person), betas_of(person)).height
-    assert f"In the scene: {f'{tall:.2f}'.rstrip('0')} m" in " ".join(shown(draw_shape, addon))
 
 
 def test_other_bodies_have_sliders_with_numbers(person):
