@@ -1,10 +1,9 @@
-"""Exports of humans: textured meshes, .human files, 3D Gaussians; imports of .human files."""
+"""Exports of humans: textured meshes, .human files, 3D Gaussians."""
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,12 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
-from ..files.regular_files import exists_in_its_folder
 from ..files.whole_files import written_whole
-from ..formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
+from ..formats.answers import GaussiansAnswer, ProxyAnswer
 from ..scene.actions import posed_on
 from ..scene.armature import check_joints
-from ..scene.human import BODY_FILE, PERSON_FILE, HumanTarget, link_part, proxy_of, session_file
+from ..scene.human import HumanTarget, link_part, proxy_of, session_file
 from ..scene.human_file import (
-    CHOOSE_ANOTHER,
-    read_human,
     read_tensors,
     reshaped,
     shape_model_of,
@@ -36,8 +32,7 @@ from ..scene.proxy import (
 )
 from ..scene.representation import MESH_IN_VIEWPORT, set_representation
 from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
-from .generate import build_person
-from .queue import PREVIEW_PX, Job
+from .queue import Job
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,65 +163,6 @@ class ExportGaussiansJob(Job):
         put(result.out, self.path)
         size = self.path.stat().st_size / 1e6
         return f"Exported {self.target.name} to {self.path.name}: {result.gaussians} Gaussians, {size:.1f} MB"
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportHumanJob(Job):
-    """Add the human of a .human file."""
-
-    kind = "import_human"
-    method = "open_human"
-    undo = "Import Human"
-
-    path: str
-    at: tuple[float, float, float] | None = None
-    """Location of the human, metres; None for the world's origin."""
-
-    @property
-    def label(self) -> str:
-        return f"Import {Path(self.path).name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}
-
-    def result_here(self, folder: Path) -> HumanAnswer | None:
-        return opened(Path(self.path), folder)
-
-    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
-        person, notice = build_person(context, result, "Imported", name_of(self.path))
-        if self.at is not None:
-            person.location.xy = self.at[:2]
-            person.location.z += self.at[2]
-        return notice
-
-
-def opened(source: Path, folder: Path) -> HumanAnswer | None:
-    """Write the human of a file into `folder`, and the file of its body where it has one.
-
-    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
-    and files of other kinds. Raises ValueError for a damaged human, OSError.
-    """
-    began = time.monotonic()
-    try:
-        human = read_tensors(source)
-    except ValueError:
-        return None
-    body = source.with_name(BODY_FILE) if "body" in human.metadata else None
-    if body is not None and not exists_in_its_folder(body):
-        return None
-    read_human(source, CHOOSE_ANOTHER)
-    write_tensors(folder / PERSON_FILE, human)
-    if body is not None:
-        shutil.copyfile(body, folder / BODY_FILE)
-    return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
-
-
-def name_of(path: str) -> str:
-    """The name for the human of this file."""
-    name = Path(path).name
-    for ending in (".safetensors", ".human"):
-        name = name.removesuffix(ending)
-    return name or "Human"
 
 
 def put(source: Path, target: Path) -> None:

@@ -23,22 +23,25 @@ from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .volumes import write_or_report
 
 
-def build_person(
-    context: bpy.types.Context, result: HumanAnswer, made: str, name: str = "Human"
-) -> tuple[bpy.types.Object, str]:
+def build_person(context: bpy.types.Context, result: HumanAnswer, made: str) -> tuple[bpy.types.Object, str]:
     """Build the human of the child's `result`; returns them and the message ("Generated in 1.2 s.").
 
     Raises as `build_human` does, and then leaves nothing.
     """
     began = time.monotonic()
-    person = build_human(context, result.person, name)
+    person = add_human(context, build_human(context, result.person))
+    notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
+    return person, " ".join([sentence(notice), *map(sentence, result.warnings)])
+
+
+def add_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.types.Object:
+    """Have a new human stand at the cursor, selected, and in sight if it is the first; returns it."""
     stand_at_cursor(context, person)
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, person)
         if len(humans(context.scene)) == 1:
             frame_in_view()
-    notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
-    return person, " ".join([sentence(notice), *map(sentence, result.warnings)])
+    return person
 
 
 def frame_in_view() -> None:

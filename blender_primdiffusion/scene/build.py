@@ -15,7 +15,7 @@ from ..formats.joints import JOINT_NAMES
 from .armature import build_armature, floor_below
 from .convention import points_to_blender
 from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part, pack
-from .human_file import read_human, shape_model_of
+from .human_file import GENERATE_AGAIN, read_human, shape_model_of
 from .representation import set_representation
 from .shape import betas_of
 from .splats import SPLATS_AVAILABLE
@@ -30,7 +30,9 @@ _KINDS = (
 )  # fmt: skip
 
 
-def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human") -> bpy.types.Object:
+def build_human(
+    context: bpy.types.Context, file: str | Path, name: str = "Human", remedy: str = GENERATE_AGAIN
+) -> bpy.types.Object:
     """Build the human of a file in a collection of their own: an armature that holds the file, and its parts.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
@@ -38,7 +40,7 @@ def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human
     no data. Makes no undo step.
     """
     file = Path(file)
-    human = read_human(file)
+    human = read_human(file, remedy)
     with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:NAME_LENGTH])
         origin = floor_below(points_to_blender(human.rest.vertices))

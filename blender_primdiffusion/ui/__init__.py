@@ -17,7 +17,6 @@ from . import (
     advanced_panel,
     captures_panel,
     edit_panel,
-    export_operators,
     export_panel,
     generate_panel,
     generate_settings,
@@ -40,7 +39,7 @@ MODULES = (
     *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel,
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
     volumes, import_motion, motion_panel, pose_panel, picture_panel,
-    render_panel, export_operators, export_panel, advanced_panel,
+    render_panel, export_panel, advanced_panel,
     captures_panel, viewport_humans, manual, menus,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""

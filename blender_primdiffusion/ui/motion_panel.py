@@ -15,7 +15,7 @@ from ..formats.poses.motion import Motion
 from ..motion.placing import FACTS, Placement, extend_range, place_motion, rounds_of, sample_motion, scene_fps
 from ..scene.blend_values import as_shown, stored_record
 from .drawing import draw_lines
-from .export_operators import destination
+from .export_panel import destination
 from .on_person import ArmatureOperator, WhereTo, target_armature
 
 _MOST_FACTS = 20

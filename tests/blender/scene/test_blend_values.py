@@ -43,7 +43,7 @@ OF_SCANS = {"primdiffusion_part"}
 OF_FILES = ("capture/scan_files.py", "primdiffusion")
 """A key in a file that captures read."""
 OPERATORS_OWN = {
-    "scene/blend_values.py", "ui/export_operators.py",
+    "scene/blend_values.py", "ui/export_panel.py",
     "ui/import_motion.py", "ui/picture_panel.py",
     "ui/setup.py",
 }  # fmt: skip

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -17,12 +18,11 @@ from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.human import BETAS, humans, proxy_of
+from blender_primdiffusion.scene.human import BETAS, BODY_FILE, humans, proxy_of
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.representation import show_in_viewport
 from blender_primdiffusion.scene.volume_nodes import volumes_of
-from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
-from blender_primdiffusion.ui.export_panel import draw_as_mesh
+from blender_primdiffusion.ui.export_panel import PRIMDIFFUSION_OT_export, draw_as_mesh
 
 OPERATORS = bpy.ops.primdiffusion
 
@@ -168,16 +168,20 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
     assert np.array(asked["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
 
 
-def test_a_human_file_goes_out_and_comes_back_with_its_shape(anna, out):
+def test_a_human_file_goes_out_and_comes_back_with_its_shape(anna, store, out):
     shape = np.linspace(-1, 1, 10)
     anna[BETAS] = shape.tolist()
     OPERATORS.export(filepath=str(out / "Anna Müller.human"))
     kept = read_tensors(out / "Anna Müller.human")
     assert json.loads(kept.metadata["provenance"]) == json.loads(str(synthetic.arrays(8)["meta"]))
     assert np.frombuffer(kept.arrays["betas"][2], "<f4") == pytest.approx(shape, abs=1e-6)
+    with pytest.raises(RuntimeError, match="body's file is missing"):
+        OPERATORS.import_human(filepath=str(out / "Anna Müller.human"))
+    shutil.copyfile(store / BODY_FILE, out / BODY_FILE)
     OPERATORS.import_human(filepath=str(out / "Anna Müller.human"))
     other = next(person for person in humans(bpy.context.scene) if person != anna)
     assert other.name == "Anna Müller"
+    assert np.array(other[BETAS]) == pytest.approx(shape, abs=1e-6)
 
 
 def test_a_human_file_holds_the_person_alone(anna, out):
@@ -186,8 +190,11 @@ def test_a_human_file_holds_the_person_alone(anna, out):
     assert set(kept.arrays) == {"rgb", "density", "delta_scale", "betas", "rest_half_extent"}
 
 
-def test_a_person_is_put_where_they_were_dropped(store):
-    OPERATORS.import_human(filepath=str(store / "person.human.safetensors"), location=(1.0, 2.0, 0.0))
+def test_a_file_is_imported_at_the_cursor_in_edit_mode_too(store):
+    bpy.ops.mesh.primitive_cube_add(location=(9.0, 9.0, 9.0))
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.context.scene.cursor.location = (1.0, 2.0, 0.0)
+    OPERATORS.import_human(filepath=str(store / "person.human.safetensors"))
     person = humans(bpy.context.scene)[0]
     assert person.location.xy[:] == pytest.approx((1.0, 2.0))
     assert person.name == "person"
