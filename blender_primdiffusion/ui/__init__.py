@@ -21,7 +21,6 @@ from . import (
     generate_panel,
     generate_settings,
     human_panel,
-    import_motion,
     jobs_panel,
     manual,
     menus,
@@ -38,7 +37,7 @@ from . import (
 MODULES = (
     *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel,
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
-    volumes, import_motion, motion_panel, pose_panel, picture_panel,
+    volumes, motion_panel, pose_panel, picture_panel,
     render_panel, export_panel, advanced_panel,
     captures_panel, viewport_humans, manual, menus,
 )  # fmt: skip

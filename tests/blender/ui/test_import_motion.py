@@ -18,7 +18,7 @@ from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.import_motion import PRIMDIFFUSION_OT_import_motion
+from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_OT_import_motion
 
 ops = bpy.ops.primdiffusion
 
