@@ -31,7 +31,8 @@ def five_humans(module: str, python: str) -> Steps:
     yield from at_rest(module)
     yield "five_local"
     press("view3d.localview", "EXEC_DEFAULT")
-    press("primdiffusion.add_camera")
+    press("object.select_all", "EXEC_DEFAULT", action="SELECT")
+    press("view3d.camera_to_view_selected", "EXEC_DEFAULT")
     press("view3d.view_camera", "EXEC_DEFAULT")
     yield from at_rest(module)
     yield "five_camera"

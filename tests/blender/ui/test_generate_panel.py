@@ -139,19 +139,17 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
 
 
 @pytest.mark.parametrize(
-    ("engine", "camera", "button"),
+    ("engine", "button"),
     [
-        ("PRIMDIFFUSION", True, "render.render"),
-        ("CYCLES", True, "render.render"),
-        ("PRIMDIFFUSION", False, "primdiffusion.add_camera"),
-        ("BLENDER_WORKBENCH", True, "primdiffusion.set_up_engine"),
+        ("PRIMDIFFUSION", "render.render"),
+        ("CYCLES", "render.render"),
+        ("BLENDER_WORKBENCH", "primdiffusion.set_up_engine"),
     ],
 )
-def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as_mesh(addon, engine, camera, button):
+def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as_mesh(addon, engine, button):
     scene, panel = addon.scene, generate_panel.PRIMDIFFUSION_PT_generate
     scene.render.engine = engine
-    if camera:
-        scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     before = shown(panel, addon)
     bpy.ops.primdiffusion.generate(seed=7)
     line, next_step, as_mesh = (text for text in shown(panel, addon) if text not in before)

@@ -227,21 +227,6 @@ def test_the_panel_says_who_draws_humans(person):
     scene.render.engine = "CYCLES"
 
 
-def test_a_camera_is_added_that_sees_the_whole_person(person):
-    from bpy_extras.object_utils import world_to_camera_view
-
-    assert ops.add_camera() == {"FINISHED"}
-    scene = bpy.context.scene
-    bpy.context.view_layer.update()
-    armature = person
-    for bone in armature.pose.bones:
-        x, y, depth = world_to_camera_view(scene, scene.camera, armature.matrix_world @ bone.head)
-        assert 0 < x < 1
-        assert 0 < y < 1
-        assert depth > 0
-    assert any(light.type == "SUN" for light in bpy.data.lights)
-
-
 def test_our_engine_leads_to_the_set_up_where_no_backend_would_render(person, monkeypatch):
     monkeypatch.setattr(preferences, "known", lambda: preferences.Known("absent", "The backend is not set up yet"))
     bpy.context.scene.render.engine = "PRIMDIFFUSION"
