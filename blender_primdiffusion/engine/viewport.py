@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import functools
-import weakref
 
 import bpy
 import gpu
 from gpu_extras.presets import draw_texture_2d
 
-from .gpu.composite import PictureTextures
 from .gpu.march import gpu_marcher
 from .gpu.picture import GpuPicture, GpuScene, GpuSolids
 from .gpu.refine import GpuRefinement, MarchRequest
 from .gpu.scene_reading import gpu_humans
 from .picture import SceneContent, SceneSolids, changed_by, scene_content, scene_solids
 from .view import region_view
-
-_viewports: weakref.WeakSet[Viewport] = weakref.WeakSet()
 
 
 class Viewport:
@@ -34,13 +30,10 @@ class Viewport:
         """With the parameters of the content that it shows; None when the solids have changed."""
         self._texture: gpu.types.GPUTexture | None = None
         """What is drawn."""
-        self.region = 0
-        """Address of the region that was drawn last."""
         self._error = ""
         """Why the scene cannot be drawn."""
         self._fault = ""
         """Why the GPU cannot draw, which is not tried again."""
-        _viewports.add(self)
 
     def update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Read the changed scene while the dependency graph may be read."""
@@ -58,7 +51,6 @@ class Viewport:
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """March what the region shows now for a moment, and draw what has come of it."""
-        self.region = context.region.as_pointer()
         if self._local not in (None, context.space_data.local_view is not None):
             self.update(context, depsgraph)  # Blender reports no change
         status = self._error
@@ -82,15 +74,6 @@ class Viewport:
             engine.unbind_display_space_shader()
             gpu.state.blend_set("NONE")
         engine.update_stats("", f"PrimDiffusion: {status}" if status else "")
-
-    def picture_above_overlays(self, context: bpy.types.Context) -> PictureTextures | None:
-        """The picture to draw again over overlays that are behind humans: Blender's overlays know the depth of its own
-        objects alone. None where that cannot be: with a view transform, which handlers lack."""
-        shown, settings = self._refinement.shown, context.scene.view_settings
-        colours = (settings.view_transform, settings.look, settings.exposure, settings.gamma)
-        if shown is None or colours != ("Standard", "None", 0, 1):
-            return None
-        return PictureTextures(self._texture, shown.picture.humans.depth)
 
     @property
     def resting(self) -> bool:
@@ -125,10 +108,3 @@ def _shown_otherwise(scene: bpy.types.Scene) -> str:
         return ""
     name = settings.bl_rna.properties["view"].enum_items[settings.view].name
     return f"3D views show Colour; render the image to see {name}"
-
-
-def picture_above_overlays(context: bpy.types.Context) -> PictureTextures | None:
-    """As `Viewport.picture_above_overlays`, for the viewport of this region."""
-    address = context.region.as_pointer()
-    viewport = next((viewport for viewport in _viewports if viewport.region == address), None)
-    return None if viewport is None else viewport.picture_above_overlays(context)

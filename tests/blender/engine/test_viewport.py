@@ -1,4 +1,4 @@
-"""A Rendered view: what it says where it cannot be drawn, and which picture goes over Blender's overlays."""
+"""A Rendered view: what it says where it cannot be drawn, and how it is refined."""
 
 import time
 from pathlib import Path
@@ -111,30 +111,3 @@ def test_a_view_is_refined_to_the_end(marcher, drawn):
     human.location.x = 5.0
     bpy.context.view_layer.update()
     assert not refined(drawn).any()
-
-
-def view_of(address: int, transform: str = "Standard", exposure: float = 0.0) -> SimpleNamespace:
-    settings = SimpleNamespace(view_transform=transform, look="None", exposure=exposure, gamma=1.0)
-    return SimpleNamespace(
-        scene=SimpleNamespace(view_settings=settings), region=SimpleNamespace(as_pointer=lambda: address)
-    )
-
-
-@pytest.fixture
-def shown():
-    """A viewport of region 7 that shows a marched picture."""
-    made = Viewport()
-    made.region, made._texture = 7, "mean"
-    made._refinement.shown = SimpleNamespace(picture=SimpleNamespace(humans=SimpleNamespace(depth="depth")))
-    return made
-
-
-def test_the_marched_picture_has_the_colours_that_are_shown_and_the_humans_depth(shown):
-    picture = viewport.picture_above_overlays(view_of(7))
-    assert (picture.colour, picture.depth) == ("mean", "depth")
-    assert viewport.picture_above_overlays(view_of(8)) is None
-
-
-def test_colours_that_a_handler_cannot_show_stay_below(shown):
-    assert viewport.picture_above_overlays(view_of(7, "AgX")) is None
-    assert viewport.picture_above_overlays(view_of(7, exposure=1.0)) is None

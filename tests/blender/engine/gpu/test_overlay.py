@@ -298,17 +298,6 @@ def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
         assert click.modal(held, around, SimpleNamespace(type=kind, value=value)) == result
 
 
-def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(people, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(module, "overlay", people.overlay)
-    monkeypatch.setattr(module, "keep_bones_in_front", lambda _context, bones: drawn.append(bones))
-    monkeypatch.setattr(module, "draw_picture", lambda picture, look: drawn.append((picture, look.again)))
-    people.overlay.scene_changed()
-    module.draw_above_overlays(context(), "picture")
-    assert drawn[0] is people.overlay.reading(context()).bones
-    assert drawn[1] == ("picture", True)
-
-
 def drawing(monkeypatch, march) -> list[tuple]:
     """Let an overlay march by this function; the parts and pictures that it draws."""
     drawn = []
