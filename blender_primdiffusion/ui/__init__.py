@@ -31,7 +31,6 @@ from . import (
     render_panel,
     shape_panel,
     variations_panel,
-    viewport_humans,
 )
 
 MODULES = (
@@ -39,7 +38,7 @@ MODULES = (
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
     volumes, motion_panel, pose_panel, picture_panel,
     render_panel, export_panel, advanced_panel,
-    captures_panel, viewport_humans, manual, menus,
+    captures_panel, manual, menus,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 
