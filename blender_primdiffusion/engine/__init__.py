@@ -44,7 +44,7 @@ def unregister() -> None:
 
 
 def shows_humans(context: bpy.types.Context) -> bool:
-    """Whether humans may be drawn into this 3D view over what Blender draws; `who_draws` then decides for each."""
+    """Whether humans may be drawn into this 3D view over what Blender draws."""
     return context.scene.primdiffusion_render.in_viewports and not by_engine(context) and any_humans()
 
 

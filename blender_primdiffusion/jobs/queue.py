@@ -19,7 +19,7 @@ from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
 from ..files.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
-from .remedies import defect_in_the_scene, error_in_the_scene, write_error_log
+from .error_log import defect_in_the_scene, error_in_the_scene, write_error_log
 
 PREVIEW_PX = 16
 """Of the child's previews, which most jobs do not use."""

@@ -1,4 +1,4 @@
-"""How jobs look in panels: button, progress, queue, errors and their remedies."""
+"""How jobs look in panels: button, progress, queue, errors."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import textwrap
 import bpy
 
 from ..files.regular_files import printable
+from ..jobs.error_log import error_log
 from ..jobs.follow import blocking_activity
 from ..jobs.queue import JobOutcome, queue
-from ..jobs.remedies import error_log, remedy_for
 from ..jobs.windows import icons
-from ..places import backend_is_named
+from ..places import EXTENSION, backend_is_named
 from .manual import draw_manual_button
 
 MAIN = "PrimDiffusion"
@@ -135,16 +135,14 @@ def draw_queue(layout: bpy.types.UILayout) -> None:
 
 
 def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
-    """The message, or the error with its remedy."""
+    """The message, or the error with its log."""
     if outcome.error is None:
         draw_lines(layout, outcome.notice, "INFO")
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # side by side the labels would be cut
-    if (remedy := remedy_for(outcome.error)) is not None:
-        props = column.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
-        for name, value in remedy.properties.items():
-            setattr(props, name, value)
+    if outcome.error.kind == "environment":
+        column.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     column.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(error_log())
 
 

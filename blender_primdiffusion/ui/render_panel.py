@@ -8,14 +8,13 @@ import bpy
 
 from ..backend.environment import NOT_INSTALLED
 from ..engine.engine import ENGINE
-from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
 from ..jobs.volumes import MergeJob, PoseSnapshot
 from ..places import backend_is_named
 from ..scene.human import HumanTarget, humans
-from ..scene.representation import in_viewport, representation_of
+from ..scene.representation import representation_of
 from ..scene.volume_nodes import fit_cycles_to_volumes
-from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
+from .drawing import SidebarPanel, draw_job_state, property_columns
 from .preferences import draw_set_up, known
 
 _FROM_EEVEE = frozenset(
@@ -151,23 +150,6 @@ def _plain_colours(scene: bpy.types.Scene) -> None:
     scene.view_settings.look = "None"
 
 
-EXACT = "Renders humans exactly, other objects with simple shading"
-APPROXIMATE = "Renders humans approximately, with light and shadows"
-UNLIT = "Renders humans approximately, with light and shadows; 3D views need Show Volumes in Viewport for that"
-OTHER_ENGINE = "Renders humans blurred: choose an engine above"
-
-
-def how_shown(scene: bpy.types.Scene) -> str:
-    """How the scene's engine shows humans, in renders and in Rendered views."""
-    engine = scene.render.engine
-    drawer = who_draws(engine, "RENDERED", all(in_viewport(person) for person in humans(scene)))
-    if drawer is Drawer.ENGINE:
-        return EXACT
-    if engine != "CYCLES":
-        return OTHER_ENGINE
-    return UNLIT if drawer is Drawer.OVERLAY else APPROXIMATE
-
-
 def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """The button that leads to a picture: an engine that shows humans as they are, the render."""
     engine = scene.render.engine
@@ -181,13 +163,12 @@ def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
 
 
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """A choice of engines for humans, and how the current one shows them."""
-    engine, line = scene.render.engine, how_shown(scene)
+    """A choice of engines for humans."""
+    engine = scene.render.engine
     row = layout.row(align=True)
     for (name, label, _), icon in zip(_ENGINES, ("SHADING_RENDERED", "SHADING_TEXTURE"), strict=True):
         if name != ENGINE or known().usable:
             row.operator("primdiffusion.set_up_engine", text=label, depress=engine == name, icon=icon).engine = name
-    draw_lines(layout, line, "INFO")
 
 
 class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):

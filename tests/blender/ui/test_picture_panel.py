@@ -143,14 +143,13 @@ def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, pictu
     mask = tmp_path / "mask.png"
     write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
     settings = chosen.scene.primdiffusion_picture
-    settings.mask, settings.mask_label, settings.seed = str(mask), 3, 5
+    settings.mask, settings.seed = str(mask), 5
     camera = chosen.scene.camera
     before = np.array(camera.matrix_world.translation)
     assert bpy.ops.primdiffusion.human_from_picture() == {"FINISHED"}
     (person,) = humans(chosen.scene)
     sent = request_of(person_file(person))
     assert (sent["pictures"], sent["masks"], sent["seed"]) == ([str(picture)], [str(mask)], 5)
-    assert sent["mask_label"] == 3
     assert Path(sent["cameras"]).name == "cameras.json"
     assert "pose" not in sent
     armature = person
@@ -209,7 +208,7 @@ def test_a_picture_dropped_onto_the_view_is_chosen_while_the_tab_is_open(addon):
 
 def test_progress_is_shown_and_cancel_leaves_no_human(chosen, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "takes long")
-    queue.add(chosen, PictureJob(PictureTask.of(chosen, "", -1, None)))
+    queue.add(chosen, PictureJob(PictureTask.of(chosen, "", None)))
     until_running()
     texts = shown(PRIMDIFFUSION_PT_human_from_picture, chosen)
     assert texts[:2] == ["primdiffusion.choose_picture", "anna.png"]
