@@ -63,7 +63,6 @@ def parser() -> CommandParser:
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     declared(CaptureSettings, "together", metavar="N")
-    declared(CaptureSettings, "shadows")
     declared(CaptureSettings, "body")
     add("--pose-files", type=Path, nargs="+", default=[], help="poses: .npz, .npy, .json, .pkl, .bvh, or folders")
     declared(CaptureSettings, "pose_count", "--poses")

@@ -181,10 +181,6 @@ def test_panels_show_representations_and_warnings(person):
     ops.merge()
     assert advanced().count("set_representation") == 2 + SPLATS_AVAILABLE
     ops.merge(what="NOTHING")
-    context.scene.render.engine = "CYCLES"
-    assert "31 volumes" in advanced()
-    context.scene.render.engine = "PRIMDIFFUSION"
-    assert "31 volumes" not in advanced(), "of no interest to this engine"
     assert shown(render_panel.PRIMDIFFUSION_PT_render, context).count("primdiffusion.set_up_engine") == 2
 
 
