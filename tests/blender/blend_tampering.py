@@ -149,7 +149,7 @@ HOLDERS: dict[str, Callable[[], Any]] = {
 }
 """What holds each custom property."""
 SETTINGS = {
-    "primdiffusion_captures": ("body", "people", "out", "poses", "hdri"),
+    "primdiffusion_captures": ("people", "out", "body", "poses", "hdri"),
     "primdiffusion_picture": ("mask",),
 }
 """Paths among the scene's settings."""
