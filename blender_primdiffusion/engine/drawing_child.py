@@ -110,10 +110,6 @@ class Frame:
         """Metres along the optical axis, flat [height * width]."""
         return self._values[self.width * self.height * 4 :]
 
-    def clear(self) -> None:
-        """Fill the picture with zeros."""
-        self._values[:] = 0
-
 
 class SharedFrames:
     """A folder among Blender's temporary files for the frame and what else the child reads; `close` removes it."""

@@ -17,8 +17,6 @@ from .who_draws import ENGINE
 
 LISTEN_S = 0.01
 """Between two looks at the child, and at whether the user has cancelled."""
-SHOW_S = 0.2
-"""Between updates of the picture in the window, each of which copies all of it."""
 
 
 class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
@@ -131,11 +129,9 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
         picture = scene_content(depsgraph, stored(scene_solids(depsgraph), frames.folder))
         view = camera_view(camera, depsgraph, size, picture.subject)
         frame = frames.take(width, height)
-        if not bpy.app.background:
-            frame.clear()  # rows that are not drawn yet
         params = {**picture.params(), **view.params(), "region": region, "frame": str(frame.path)}
         request = drawing_child.draw(params)
-        _follow(engine, request, result, frame, view)
+        _follow(engine, request)
         if request.error is not None:
             raise ChildProcessError(str(request.error))
         _fill(result, frame, view)
@@ -145,14 +141,7 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
     return request
 
 
-def _follow(
-    engine: bpy.types.RenderEngine,
-    request: ChildRequest,
-    result: bpy.types.RenderResult,
-    frame: Frame,
-    view: PinholeView,
-) -> None:
-    shown_rows, shown_at = 0, time.monotonic()
+def _follow(engine: bpy.types.RenderEngine, request: ChildRequest) -> None:
     while not request.finished:
         if engine.test_break():
             request.cancel()
@@ -161,10 +150,6 @@ def _follow(
             continue
         engine.update_stats("", _stats(request))
         engine.update_progress(request.fraction)
-        if not bpy.app.background and request.step > shown_rows and time.monotonic() - shown_at > SHOW_S:
-            _fill(result, frame, view)
-            engine.update_result(result)
-            shown_rows, shown_at = request.step, time.monotonic()
 
 
 def _stats(request: ChildRequest) -> str:

@@ -263,18 +263,6 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         draw_lines(layout, "Shape or clothes have changed: add it again", "INFO")
 
 
-def draw_as_mesh(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """For the selected human: a button that adds a mesh proxy, with its progress; where there is one, what is shown."""
-    try:
-        person = selected_person(context)
-    except ValueError:
-        return
-    if proxy_of(person) is None:
-        draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH", text="As Mesh")
-    else:
-        draw_representations(layout, person)
-
-
 def draw_from_file(layout: bpy.types.UILayout) -> None:
     """Humans from .human files."""
     draw_samples(layout)

@@ -10,7 +10,7 @@ from ..jobs.generate import GenerateJob
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .drawing import BackendPanel, draw_job, draw_lines, draw_section, property_columns
-from .export_panel import draw_as_mesh, draw_from_file
+from .export_panel import draw_from_file
 from .generate_settings import draw_attributes, last_seed, random_seed, sampling, seed_property
 from .menus import draw_samples
 from .preferences import draw_set_up
@@ -76,8 +76,6 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
             draw_lines(layout, sentence(f"{queue.child_message}; restarts with the next human"), "ERROR")
         if humans(context.scene) and not queue.busy:
             draw_next_step(layout, context.scene)
-        if ready:
-            draw_as_mesh(layout, context)
         page, section = "first_human", "variations"
         if (body := draw_section(layout, "attributes", text="Attributes", page=page, section="attributes")) is not None:
             draw_attributes(body, settings.attributes)

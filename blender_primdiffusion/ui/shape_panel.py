@@ -7,18 +7,17 @@ from collections.abc import Sequence
 
 import bpy
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..files.regular_files import printable
 from ..scene.actions import action_curves
 from ..scene.edit import check_shapeable, reshape
-from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human, selected_person
+from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, is_human, selected_person
 from ..scene.human_file import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
 from .drawing import draw_lines, draw_section, property_columns
-from .on_person import HumanOperator, other_human
+from .on_person import HumanOperator
 
 _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
@@ -26,10 +25,7 @@ _FARTHEST = 3.0
 _SHAPES = (
     ("RANDOM", "Random", "Give the selected human a random body shape; the same seed gives the same shape"),
     ("GENERATED", "As Generated", "Reset the selected human to the shape of the last edit, or of generation"),
-    ("OTHER", "Other Human", "Copy the body shape of the other human to the selected human"),
 )
-_SETTINGS = {"RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ()}
-"""Properties of the operator that matter, by shape."""
 
 
 def person_of(armature: bpy.types.Object) -> bpy.types.Object:
@@ -141,7 +137,7 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
 
 
 class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
-    """Set the body shape of the selected human: at random, as generated, or as another human's"""
+    """Set the body shape of the selected human: at random, or as generated"""
 
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
@@ -165,31 +161,16 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
-        for name in ("to", *_SETTINGS[self.to]):
+        for name in ("to", "seed", "spread") if self.to == "RANDOM" else ("to",):
             layout.prop(self, name)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        warning = reshape(person, self._betas(context, person))
+    def run(self, _context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
+        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
+        random_betas = np.clip(drawn, -_FARTHEST, _FARTHEST)
+        warning = reshape(person, random_betas if self.to == "RANDOM" else generated_betas(person))
         if warning:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
-
-    def _betas(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
-        """The new shape [10]. Raises ValueError."""
-        if self.to == "GENERATED":
-            return generated_betas(person)
-        if self.to == "OTHER":
-            return self._betas_of_other(context, person)
-        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
-        return np.clip(drawn, -_FARTHEST, _FARTHEST)
-
-    def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
-        other = other_human(context, person)
-        if len(shape_model_of(other).template) != len(shape_model_of(person).template):
-            raise ValueError(
-                f"{other.name!r} stands on another body than {person.name!r}: their shape parameters are not comparable"
-            )
-        return betas_of(other)
 
 
 _ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
@@ -211,11 +192,6 @@ def draw_shape(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row = layout.row(align=True)
     row.operator("primdiffusion.reshape", text="Random", icon="FILE_REFRESH").to = "RANDOM"
     row.operator("primdiffusion.reshape", text="Reset", icon="LOOP_BACK").to = "GENERATED"
-    if len(humans(context.scene)) > 1:
-        row = layout.row(align=True)
-        row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
-        if context.scene.primdiffusion_edit.other is not None:
-            row.operator("primdiffusion.reshape", text="", icon="PASTEDOWN").to = "OTHER"
     if _animated(person):
         draw_lines(layout, _ANIMATED, "INFO")
     if (body := draw_section(layout, "more_sliders", text="More Sliders")) is not None:

@@ -22,7 +22,7 @@ from blender_primdiffusion.scene.human import BETAS, BODY_FILE, humans, proxy_of
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.representation import show_in_viewport
 from blender_primdiffusion.scene.volume_nodes import volumes_of
-from blender_primdiffusion.ui.export_panel import PRIMDIFFUSION_OT_export, draw_as_mesh
+from blender_primdiffusion.ui.export_panel import PRIMDIFFUSION_OT_export
 
 OPERATORS = bpy.ops.primdiffusion
 
@@ -127,22 +127,6 @@ def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
     assert (proxy.hide_viewport, proxy.hide_render) == (True, True)
     assert not volumes_of(anna).hide_viewport
     assert not volumes_of(anna).hide_render
-
-
-def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
-    def drawn() -> dict[str, str]:
-        layout = MagicMock()
-        draw_as_mesh(layout, bpy.context)
-        made = (*layout.row().operator.call_args_list, *layout.grid_flow().operator.call_args_list)
-        return {call.kwargs["text"]: call.kwargs.get("depress") for call in made}
-
-    assert drawn() == {"As Mesh": None}
-    OPERATORS.add_proxy()
-    assert {"Mesh": False, "Mesh in Viewport": True, "Volumes": False}.items() <= drawn().items()
-    OPERATORS.set_representation(representation="NO_MESH")
-    assert drawn() == {"As Mesh": None}
-    bpy.context.scene.collection.children.unlink(bpy.data.collections[anna.name])
-    assert drawn() == {}
 
 
 def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):

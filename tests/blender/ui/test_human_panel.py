@@ -150,28 +150,6 @@ def test_each_press_of_random_is_another_body(person, addon):
     assert pressed[0].seed != pressed[1].seed
 
 
-def test_a_shape_is_copied_from_the_other_person(person, other):
-    reshape(other, np.array(TALL))
-    bpy.context.scene.primdiffusion_edit.other = other
-    assert ops.reshape(to="OTHER", human="Human") == {"FINISHED"}
-    np.testing.assert_allclose(betas_of(person), TALL)
-    bpy.context.scene.primdiffusion_edit.other = person
-    reshape(person, np.zeros(10))
-    assert ops.reshape(to="OTHER", human="Ötzi") == {"FINISHED"}
-    assert not betas_of(other).any()
-
-
-@pytest.mark.parametrize(
-    ("other", "sentence"),
-    [(None, "choose the other human"), ("Human", "cannot be the other"), ("Eve", "not in the")],
-)
-def test_copying_without_another_human_is_rejected(person, other, sentence):
-    bpy.data.objects.new("Eve", None)
-    bpy.context.scene.primdiffusion_edit.other = bpy.data.objects.get(other or "")
-    with pytest.raises(RuntimeError, match=sentence):
-        ops.reshape(to="OTHER")
-
-
 def test_the_panel_shows_provenance(person, addon):
     person[MARK] = json.dumps(
         {
