@@ -10,7 +10,7 @@ from ..scene.human import any_humans
 from . import drawing_child
 from .engine import ENGINE, PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine
 from .gpu import overlay
-from .who_draws import view_engine
+from .view import view_engine
 
 _draw_handlers: list[object] = []
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)

@@ -11,9 +11,8 @@ from ..formats.requests import RAY_STEP
 from . import drawing_child
 from .drawing_child import Frame, frames
 from .picture import scene_content, scene_solids, stored
-from .view import PinholeView, blender_depth, camera_view, wanted_region
+from .view import ENGINE, PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
-from .who_draws import ENGINE
 
 LISTEN_S = 0.01
 """Between two looks at the child, and at whether the user has cancelled."""

@@ -53,18 +53,13 @@ class Viewport:
         """March what the region shows now for a moment, and draw what has come of it."""
         if self._local not in (None, context.space_data.local_view is not None):
             self.update(context, depsgraph)  # Blender reports no change
-        status = self._error
-        if self._fault:
-            status = self._fault
-        elif self._content is not None:
+        if self._content is not None and not self._fault:
             try:
                 self._march(self._content, context)
-                status = _shown_otherwise(depsgraph.scene)
             except (ValueError, OSError) as error:  # until the scene changes
                 self._content, self._error = None, str(error)
-                status = self._error
             except RuntimeError as error:
-                status = self._fault = str(error)
+                self._fault = str(error)
         if not self.resting:
             engine.tag_redraw()
         if self._texture is not None:
@@ -73,6 +68,7 @@ class Viewport:
             draw_texture_2d(self._texture, (0, 0), context.region.width, context.region.height)
             engine.unbind_display_space_shader()
             gpu.state.blend_set("NONE")
+        status = self._fault or self._error
         engine.update_stats("", f"PrimDiffusion: {status}" if status else "")
 
     @property
@@ -99,12 +95,3 @@ class Viewport:
             gpu_humans().keep_only(content.people)
             self._scene = params, GpuScene(humans, self._solids, content.background, content.step)
         return self._scene[1]
-
-
-def _shown_otherwise(scene: bpy.types.Scene) -> str:
-    """What to say where renders show something else than 3D views."""
-    settings = scene.primdiffusion_render
-    if settings.view == "COLOUR":
-        return ""
-    name = settings.bl_rna.properties["view"].enum_items[settings.view].name
-    return f"3D views show Colour; render the image to see {name}"

@@ -22,11 +22,9 @@ from . import (
     generate_settings,
     human_panel,
     jobs_panel,
-    manual,
     menus,
     motion_panel,
     picture_panel,
-    pose_panel,
     preferences,
     render_panel,
     shape_panel,
@@ -36,9 +34,9 @@ from . import (
 MODULES = (
     *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel,
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
-    volumes, motion_panel, pose_panel, picture_panel,
+    volumes, motion_panel, picture_panel,
     render_panel, export_panel, advanced_panel,
-    captures_panel, manual, menus,
+    captures_panel, menus,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

@@ -10,7 +10,6 @@ import bpy
 from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, own_python_has_backend, state_of
 from ..backend.requests import sentence
 from ..jobs.follow import redraw
-from ..jobs.queue import queue
 from ..places import EXTENSION, INSTALLS_BACKEND, installed_backend, preference, set_up_folder
 from .drawing import draw_lines
 
@@ -103,17 +102,7 @@ def cancel_set_up() -> None:
     redraw()
 
 
-def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    """What the former Python did is of no interest any more."""
-    if setup:
-        setup.session.error = setup.session.notice = ""
-    for kind, outcome in list(queue.outcomes.items()):
-        if outcome.error is not None and outcome.error.kind == "environment":
-            del queue.outcomes[kind]
-    redraw()
-
-
-def _captures_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+def _changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
     redraw()
 
 
@@ -130,7 +119,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="Python 3.11 or newer with PrimDiffusion's packages (torch), or the program primdiffusion; empty: "
         + ("the private environment" if setup else "the program on the PATH"),
         subtype="FILE_PATH",
-        update=_python_changed,
+        update=_changed,
     )
     checkpoint: bpy.props.StringProperty(
         name="Checkpoint",
@@ -140,7 +129,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
     captures: bpy.props.BoolProperty(
         name="Captures",
         description="Show the panel Captures in the sidebar: training data from scans",
-        update=_captures_changed,
+        update=_changed,
     )
 
     def draw(self, _context: bpy.types.Context) -> None:

@@ -18,7 +18,7 @@ from ...scene.splats import SPLATS_MARK
 from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman, human_armatures, pose_of, visible_instances
-from ..who_draws import renders_volumes, view_engine
+from ..view import renders_volumes, view_engine
 from .march import GpuPayload
 from .shaders import cache_until_exit
 

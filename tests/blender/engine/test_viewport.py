@@ -80,13 +80,6 @@ def test_a_human_that_cannot_be_drawn_is_named_until_the_scene_changes(drawn, mo
     assert drawn.draw() == ""
 
 
-def test_a_view_says_where_renders_show_something_else(drawn, monkeypatch):
-    monkeypatch.setattr(drawn.view, "_march", lambda *_given: None)
-    assert drawn.draw() == ""
-    drawn.scene.primdiffusion_render.view = "BOXES"
-    assert drawn.draw() == "PrimDiffusion: 3D views show Colour; render the image to see Primitives"
-
-
 def refined(drawn) -> np.ndarray:
     """The picture [h, w, 4], from the bottom, once the view rests; drawn as often as the engine asks for it."""
     for draws in range(1, 500):

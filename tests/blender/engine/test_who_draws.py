@@ -3,7 +3,7 @@
 import bpy
 import pytest
 
-from blender_primdiffusion.engine.who_draws import renders_volumes, view_engine
+from blender_primdiffusion.engine.view import renders_volumes, view_engine
 
 pytestmark = pytest.mark.any_blender
 EEVEE = "BLENDER_EEVEE"

@@ -20,7 +20,7 @@ from blender_primdiffusion.jobs.variations import Variation, sheet
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human_file import shape_model_of
-from blender_primdiffusion.ui import drawing, generate_panel
+from blender_primdiffusion.ui import generate_panel
 
 pytestmark = pytest.mark.any_blender
 SMALL_WINDOW_PX = 620
@@ -38,13 +38,6 @@ def human(addon, tmp_path, monkeypatch):
     outcome = JobOutcome(MagicMock(), "Generated in 47.6 s, and after that built in 2.9 s.")
     monkeypatch.setitem(queue.outcomes, "generate", outcome)
     return human
-
-
-def test_numbers_keep_their_units_where_lines_break():
-    lines = drawing._wrapped("Generated in 47.6 s, and after that built in 2.9 s.")
-    assert not any(line.startswith(("s,", "s.")) for line in lines)
-    assert " ".join(lines) == "Generated in 47.6 s, and after that built in 2.9 s."
-    assert max(map(len, lines)) <= drawing._LINE
 
 
 def test_captures_are_shown_where_the_preferences_ask_for_them(human):

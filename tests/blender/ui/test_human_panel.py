@@ -22,7 +22,7 @@ from blender_primdiffusion.scene.handles import has_handles
 from blender_primdiffusion.scene.human import BETAS, MARK, body_of, humans
 from blender_primdiffusion.scene.human_file import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
-from blender_primdiffusion.ui import pose_panel
+from blender_primdiffusion.ui import human_panel
 from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (
@@ -212,18 +212,18 @@ def test_the_panel_leads_to_the_asset_shelf_of_pose_mode(addon, armature):
         ("show_region_asset_shelf", "object.posemode_toggle"),
     ):
         layout = Layout()
-        pose_panel.draw_pose(layout, addon)
+        human_panel.draw_pose(layout, addon)
         assert button in layout.of("button", "prop")
         assert other not in layout.of("button", "prop")
         bpy.ops.object.posemode_toggle()
 
 
 def test_the_panel_offers_to_add_handles_or_else_to_bake_them(addon, armature):
-    drawn = set(shown(pose_panel.draw_pose, addon))
+    drawn = set(shown(human_panel.draw_pose, addon))
     assert "primdiffusion.add_handles" in drawn
     assert "primdiffusion.bake_handles" not in drawn
     assert ops.add_handles() == {"FINISHED"}
-    drawn = set(shown(pose_panel.draw_pose, addon))
+    drawn = set(shown(human_panel.draw_pose, addon))
     assert "primdiffusion.bake_handles" in drawn
     assert "primdiffusion.add_handles" not in drawn
     assert ops.bake_handles() == {"FINISHED"}

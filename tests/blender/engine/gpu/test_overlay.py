@@ -285,8 +285,7 @@ def test_a_view_that_the_engine_draws_now_is_not_refined_beside_it(monkeypatch):
     overlay._picture_of(shown.region).want(MarchRequest("before", None, None))
     assert not overlay.resting
     monkeypatch.setattr(module, "overlay", overlay)
-    for name in ("shows_humans", "_shows_overlays"):
-        monkeypatch.setattr(engine, name, lambda _context: False)
+    monkeypatch.setattr(engine, "shows_humans", lambda _context: False)
     monkeypatch.setattr(engine, "bpy", SimpleNamespace(context=shown))
     engine._draw_humans()
     assert overlay.resting
