@@ -143,7 +143,7 @@ def test_the_timer_is_due_where_an_armature_was_deleted(windowed):
     bpy.ops.object.delete()
     bpy.context.view_layer.update()
     assert windowed()
-    assert len(orphans()) == 3
+    assert len(orphans()) == 2
 
 
 def test_nothing_is_due_where_undo_has_led_until_objects_come_or_go(windowed):
