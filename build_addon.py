@@ -78,7 +78,8 @@ def viewer_contents(gallery: Path | None = None) -> dict[str, Path]:
         raise BuildError(f"there are no .human files in {gallery}: make some with scripts/make_gallery.py")
     for path in humans:
         if path.stat().st_size > LARGEST_IN_GALLERY:
-            raise BuildError(f"{path} is larger than {LARGEST_IN_GALLERY / 1e6:.0f} MB: export it as a compact file")
+            limit = f"{LARGEST_IN_GALLERY / 1e6:.0f} MB"
+            raise BuildError(f"{path} is larger than {limit}: generate it with scripts/make_gallery.py")
         files[f"gallery/{path.name}"] = path
     return dict(sorted(files.items()))
 

@@ -46,6 +46,7 @@ from blender_primdiffusion.engine import engine
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import body_of
+from blender_primdiffusion.scene.place import is_solid
 
 SIZE = 512
 WARM_UP, FRAMES = 3, 15
@@ -245,8 +246,12 @@ def over_cycles(person: bpy.types.Object, folder: Path) -> np.ndarray:
     """The engine's people over Cycles' solids; the hidden body mesh casts its shadow on them."""
     scene = bpy.context.scene
     scene.render.film_transparent = True
-    scene.primdiffusion_render.solids = "HOLDOUT"
+    solids = [obj for obj in scene.objects if is_solid(obj)]
+    for obj in solids:
+        obj.is_holdout = True
     above = picture(folder)
+    for obj in solids:
+        obj.is_holdout = False
     scene.render.film_transparent = False
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.device = CYCLES_SAMPLES, "CPU"

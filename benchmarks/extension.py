@@ -119,7 +119,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
 
     motion = _amass_file(arguments.folder / "amass.npz")
     start = time.perf_counter()
-    bpy.ops.primdiffusion.import_motion(filepath=str(motion), timing="SOURCE")
+    bpy.ops.primdiffusion.import_motion(filepath=str(motion))
     keyed = time.perf_counter() - start
     figures: dict[str, float | None] = {
         "build_seconds": built,
@@ -130,7 +130,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
 
 
 def memory(arguments: argparse.Namespace) -> dict[str, float]:
-    """Blender's memory for one person after all grids are read, and after Release Memory."""
+    """Blender's memory for one person after all grids are read."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
 
@@ -140,9 +140,7 @@ def memory(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.ops.primdiffusion.volumes_in_viewport()
     bpy.context.view_layer.update()
     record.trim()
-    read = record.resident_mb() - before
-    bpy.ops.primdiffusion.cancel(what="MEMORY")
-    return {"ram_per_human_mb": read, "ram_per_human_released_mb": record.resident_mb() - before}
+    return {"ram_per_human_mb": record.resident_mb() - before}
 
 
 def merged(arguments: argparse.Namespace) -> dict[str, float]:

@@ -119,14 +119,6 @@ class Machine:
     driver: int | None
     """The driver's major version, where a file of the system states it."""
 
-    @property
-    def described(self) -> str:
-        """The machine in a few words, for the panel."""
-        owner, _, chip = self.platform.partition("_")
-        chip = NAMES["apple"] if self.platform == "macos_arm64" else f"{owner.title()} {chip}"
-        card = f", NVIDIA driver{f' {self.driver}' if self.driver else ''}" if self.nvidia else ""
-        return f"{chip}{card}, Python {self.python[0]}.{self.python[1]}"
-
 
 def this_machine() -> Machine:
     """The machine we run on. Reads one small file at most."""
@@ -201,7 +193,7 @@ _WHAT_WENT_WRONG = (
     (
         r"DO NOT MATCH THE HASHES.*?\n\s+(\S+)[^\n]*\n\s+Expected sha256",
         "the file of {0} is not the right one (its hash differs) and was not installed: try again, or ask who runs "
-        "your package mirror or made your folder of wheels",
+        "your package mirror",
     ),
     (r"No space left on device|\[Errno 28\]|WinError 112", "the disk is full: free some space, then try again"),
     (
@@ -212,13 +204,11 @@ _WHAT_WENT_WRONG = (
         r"Failed to establish a new connection|Temporary failure in name resolution|getaddrinfo failed|"
         r"nodename nor servname|Network is unreachable|ReadTimeoutError|ConnectTimeoutError|ProxyError|"
         r"Connection(?:Reset|Aborted)Error|IncompleteRead",
-        "the package index cannot be reached: check the network and the proxy, then try again, "
-        "or use Install from Folder",
+        "the package index cannot be reached: check the network and the proxy, then try again",
     ),
     (
         r"No matching distribution found for (\S+)",
-        "there is no {0} for this Python and system: check the network and your pip settings, or, for Install from "
-        "Folder, fetch the wheels with 'pip download' (see the manual)",
+        "there is no {0} for this Python and system: check the network and your pip settings",
     ),
 )
 

@@ -135,23 +135,6 @@ class Backend:
         self._ending.clear()
 
 
-_SETTINGS = {
-    "views": "lower Views",
-    "seeds": "lower Count",
-    "voxel": "raise Voxel Size",
-    "width": "lower the resolution",
-}
-"""By the parameter of the child's method that they become."""
-
-
-def memory_advice(params: Mapping[str, Any]) -> str:
-    """What to do, of the request that asked for too much; the number of steps takes time and no memory."""
-    lower = [advice for name, advice in _SETTINGS.items() if name in params]
-    lower.append("close other programs" if lower else "choose a smaller Checkpoint in the preferences")
-    steps = " (fewer Steps would not help)" if "steps" in params else ""
-    return f"{', or '.join(lower)}{steps}"
-
-
 State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
 CANCELLED_CODE = -32001
@@ -311,8 +294,7 @@ class ChildRequest:
             if event.code == CANCELLED_CODE:
                 self._end("cancelled", "Cancelled")
             else:
-                remedy = memory_advice(self._params) if event.kind == "out_of_memory" else event.remedy
-                self._fail(RequestError(event.message, remedy, event.kind, self._log()))
+                self._fail(RequestError(event.message, event.remedy, event.kind, self._log()))
         elif isinstance(event, Died):
             self._clear_leftovers()
             if self._cancel_asked_at is not None:
@@ -322,8 +304,7 @@ class ChildRequest:
                 message = f"{self._client.python} cannot run the backend: {said}"
                 self._fail(RequestError(message, USABLE_PYTHON, "environment", event.stderr))
             else:
-                remedy = f"Try again; if it was the memory, {memory_advice(self._params)}"
-                self._fail(RequestError(event.message, remedy, "died", event.stderr))
+                self._fail(RequestError(event.message, "Try again, with other programs closed", "died", event.stderr))
         elif isinstance(event, Silent):
             self._kill()
             message = f"the backend hung: it sent nothing for {event.seconds:.0f} s and was ended"

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import mimetypes
 import os
 import sys
 import time
@@ -21,7 +20,7 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-from ..files.regular_files import check_regular, remove_file, remove_folder
+from ..files.regular_files import remove_file, remove_folder
 from ..files.whole_files import write_atomically
 from .client import BackendClient
 from .environment import MARK, SetUpFolder
@@ -30,7 +29,7 @@ from .requests import Backend, ChildRequest, Step, Steps
 
 OFFLINE = (
     "Blender may not use the network; allow it in Preferences > System > Network > Allow Online Access, "
-    "or use Install from Folder"
+    "or name an existing Python in the extension's preferences"
 )
 _TRIAL = {"seed": 0, "steps": 3, "size": 16}
 _DOWNLOADED, _INSTALLED = 0.6, 0.9
@@ -43,18 +42,11 @@ _INSTALL = (
 """Named wheels of known hashes alone, nothing built. The self-test compiles what the child imports."""
 
 
-def set_up(
-    folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path | None, wheels: Path | None = None
-) -> Steps:
-    """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
-    a human. `compute` (cpu, cuda or apple) is for its mark. Raises RuntimeError, and OSError."""
+def set_up(folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path | None) -> Steps:
+    """Rebuild the environment from the package index; it is ready once it has generated a human. `compute` (cpu, cuda
+    or apple) is for its mark. Raises RuntimeError, and OSError."""
     python, host = folder.python, sys.executable
     _check_own(folder)
-    for path in () if wheels is None else wheels.iterdir():
-        if mimetypes.guess_type(path.name)[0] == "text/html":
-            raise RuntimeError(f"{path} is a web page, whose links pip would follow: remove it from the folder")
-        if path.suffix == ".whl":
-            check_regular(path)  # pip would wait for ever for a pipe
     folder.root.mkdir(parents=True, exist_ok=True)
     remove_file(folder.environment / MARK, folder.environment)
     remove_folder(folder.temporary, folder.temporary.parent)
@@ -65,10 +57,9 @@ def set_up(
     making = [host, *_VENV, str(folder.environment)]
     for _ in followed(making, folder.log, environment, _no_venv):
         yield Step("Making the environment", 0.0)
-    source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
     requirements = folder.temporary / "requirements.txt"
     write_atomically(requirements, lock.requirements)
-    command = [*_pip(python), *_INSTALL, *source, "-r", str(requirements)]
+    command = [*_pip(python), *_INSTALL, "-r", str(requirements)]
     for said in followed(command, folder.log, environment, what_went_wrong):
         yield _installing(folder, lock, said)
     about = yield from _trial(python, module_path, cache, folder.temporary)

@@ -1,8 +1,4 @@
-"""Scans that stand together on a floor, in front of the same cameras. Each is rendered alone.
-
-If asked, the others of its group are in the scene too, where rays of the camera pass through them: they shade it and
-reflect light onto it, and leave its coverage, depth, normals and parts as they are.
-"""
+"""Scans that stand together on a floor, in front of the same cameras. Each is rendered alone."""
 
 from __future__ import annotations
 
@@ -37,8 +33,6 @@ class Placed:
     """Of all of the group."""
     first: str
     """Name of the first of the group, whose seeds choose the HDRIs."""
-    others: tuple[tuple[ScanFile, Motion], ...] = ()
-    """The others of the group, with their poses at their places."""
 
 
 def groups_of(ordered: Sequence[ScanFile], size: int) -> Iterator[Sequence[ScanFile]]:
@@ -67,23 +61,10 @@ def place_group(
             extents.append([_extent(scan, *pose) for pose in zip(rotations, pelvis[-1], strict=True)])
     moves, corners = stand_together(np.array(pelvis), np.array(extents), rng)
     views = list(settings.cameras) or settings.rig.views(*bounding_sphere(corners))
-    placed = [
-        (scan_file, dataclasses.replace(poses, rotations=rotations, translations=move))
-        for scan_file, rotations, move in zip(group, own, moves, strict=True)
-    ]
     return {
-        scan_file.name: Placed(motion, views, group[0].name, tuple(p for p in placed if p[0] is not scan_file))
-        for scan_file, motion in placed
+        scan_file.name: Placed(dataclasses.replace(poses, rotations=rotations, translations=move), views, group[0].name)
+        for scan_file, rotations, move in zip(group, own, moves, strict=True)
     }
-
-
-def load_neighbours(context: bpy.types.Context, placed: Placed, body: Body, load) -> list[tuple[Scan, Motion]]:
-    """Load the others of a subject's group, invisible to the camera, with their poses. Raises as `load`."""
-    neighbours = [(load(context, scan_file, body), motion) for scan_file, motion in placed.others]
-    for neighbour, _ in neighbours:
-        for obj in neighbour.objects:
-            obj.visible_camera = False
-    return neighbours
 
 
 def _about_the_vertical(yaw: NDArray) -> NDArray[np.float64]:

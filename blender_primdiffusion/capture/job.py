@@ -36,7 +36,7 @@ from ..formats.poses.skeleton import joint_positions
 from ..formats.requests import FLOAT_DEPTH
 from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
-from .group import Placed, groups_of, load_neighbours, place_group
+from .group import Placed, groups_of, place_group
 from .passes import write_passes
 from .scan import Scan, load_scan
 from .scan_files import ScanFile
@@ -209,7 +209,6 @@ def _capture(
             for obj in scan.objects:
                 mark_parts(obj, scan.joint_of_group)
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
-            neighbours = load_neighbours(own, placed, body, load) if settings.shadows else []
             views = placed.views or _views_around(scan, settings, poses)
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
         theta = poses.axis_angle().reshape(len(poses), 72)
@@ -223,8 +222,6 @@ def _capture(
             if missing:
                 with stage.entered():
                     scan.pose(poses.rotations[frame], poses.translations[frame])
-                    for neighbour, motion in neighbours:
-                        neighbour.pose(motion.rotations[frame], motion.translations[frame])
             for camera, view in enumerate(views):
                 if camera in missing:
                     with clock.rendering():

@@ -61,8 +61,6 @@ class CaptureSettings:
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
     together: Annotated[int, Range(1, MOST)] = 1
     """Number of people who stand together on a floor, in front of the same cameras; each is rendered alone."""
-    shadows: bool = False
-    """People who stand together shade each other under a dome or HDRI light; the pictures differ in colours alone."""
     released_reference: bool = False
     """Also store the first subject under the name that the released code expects."""
     body: Path | None = None
@@ -82,8 +80,6 @@ class CaptureSettings:
                 self.together > 1 and self.released_reference,
             "people who stand together are rendered alone: put pictures behind them with captures coco --backgrounds":
                 self.together > 1 and self.background == "hdri",
-            "shadows between people need --together 2 or more, and the light dome or hdri":
-                self.shadows and (self.together < 2 or self.light == "uniform"),
             f"shard {index}/{count}: 0/{count} to {count - 1}/{count}": not 0 <= index < count,
         }  # fmt: skip
         for sentence, is_so in wrong.items():
@@ -131,7 +127,6 @@ class CaptureSettings:
             "part_names": list(JOINT_NAMES),
             "released_reference": self.released_reference,
             **({"together": self.together} if self.together > 1 else {}),
-            **({"shadows": True} if self.shadows else {}),
             **({"hdris": [path.name for path in self.hdris]} if self.hdri and self.hdri.is_dir() else {}),
         }
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import bpy
 
 from ..scene.human import any_humans
-from . import drawing_child, viewport
+from . import drawing_child
 from .engine import ENGINE, PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine
 from .gpu import overlay
-from .who_draws import view_engine
+from .view import view_engine
 
 _draw_handlers: list[object] = []
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)
@@ -44,7 +44,7 @@ def unregister() -> None:
 
 
 def shows_humans(context: bpy.types.Context) -> bool:
-    """Whether humans may be drawn into this 3D view over what Blender draws; `who_draws` then decides for each."""
+    """Whether humans may be drawn into this 3D view over what Blender draws."""
     return context.scene.primdiffusion_render.in_viewports and not by_engine(context) and any_humans()
 
 
@@ -57,15 +57,8 @@ def _draw_humans() -> None:
     context = bpy.context
     if shows_humans(context):
         overlay.overlay.draw(context)
-        return
-    overlay.overlay.leave(context.region)
-    if _shows_overlays(context) and (picture := viewport.picture_above_overlays(context)):
-        overlay.draw_above_overlays(context, picture)
-
-
-def _shows_overlays(context: bpy.types.Context) -> bool:
-    """Whether the engine draws this 3D view, beneath Blender's overlays."""
-    return by_engine(context) and context.space_data.overlay.show_overlays
+    else:
+        overlay.overlay.leave(context.region)
 
 
 def _draw_error() -> None:

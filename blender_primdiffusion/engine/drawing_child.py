@@ -52,7 +52,7 @@ def draw(params: Mapping[str, Any]) -> ChildRequest:
 
 
 def end_when_idle(seconds: float) -> None:
-    """End a child that has not drawn for so long; 0 for never. For a timer; never waits.
+    """End a child that has not drawn for so long. For a timer; never waits.
 
     Blender renders in a thread, which has the child to itself: no render can start while a timer runs.
     """
@@ -62,7 +62,7 @@ def end_when_idle(seconds: float) -> None:
         _child.used_at = time.monotonic()
         return
     _child.backend.reap()
-    if _child.backend.client is not None and 0 < seconds < time.monotonic() - _child.used_at:
+    if _child.backend.client is not None and seconds < time.monotonic() - _child.used_at:
         _child.backend.release()
 
 
@@ -109,10 +109,6 @@ class Frame:
     def depth(self) -> NDArray[np.float32]:
         """Metres along the optical axis, flat [height * width]."""
         return self._values[self.width * self.height * 4 :]
-
-    def clear(self) -> None:
-        """Fill the picture with zeros."""
-        self._values[:] = 0
 
 
 class SharedFrames:

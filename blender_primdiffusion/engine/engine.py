@@ -10,15 +10,12 @@ from ..backend.requests import ChildRequest
 from ..formats.requests import RAY_STEP
 from . import drawing_child
 from .drawing_child import Frame, frames
-from .picture import scene_content, solids_file
-from .view import PinholeView, blender_depth, camera_view, wanted_region
+from .picture import scene_content, scene_solids, stored
+from .view import ENGINE, PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
-from .who_draws import ENGINE
 
 LISTEN_S = 0.01
 """Between two looks at the child, and at whether the user has cancelled."""
-SHOW_S = 0.2
-"""Between updates of the picture in the window, each of which copies all of it."""
 
 
 class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
@@ -103,21 +100,6 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
         default="COLOUR",
         update=_redraw,
     )
-    solids: bpy.props.EnumProperty(
-        name="Solid Objects",
-        description="How meshes and other surfaces are drawn",
-        items=(
-            ("SHADED", "Shaded", "Drawn with simple shading; they hide humans behind"),
-            (
-                "HOLDOUT",
-                "Holdout",
-                "Not drawn, but they cut holes into humans, for compositing over a Cycles render",
-            ),
-            ("IGNORED", "Ignored", "Humans are drawn as if they were not there"),
-        ),
-        default="SHADED",
-        update=_redraw,
-    )
     in_viewports: bpy.props.BoolProperty(
         name="Humans",
         description="Show generated humans in 3D views as the PrimDiffusion engine draws them, wherever their volumes "
@@ -143,14 +125,12 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
     result = engine.begin_result(0, 0, width, height, layer=depsgraph.view_layer_eval.name)
     finished = False
     try:
-        picture = scene_content(depsgraph, solids_file(depsgraph, frames.folder))
+        picture = scene_content(depsgraph, stored(scene_solids(depsgraph), frames.folder))
         view = camera_view(camera, depsgraph, size, picture.subject)
         frame = frames.take(width, height)
-        if not bpy.app.background:
-            frame.clear()  # rows that are not drawn yet
         params = {**picture.params(), **view.params(), "region": region, "frame": str(frame.path)}
         request = drawing_child.draw(params)
-        _follow(engine, request, result, frame, view)
+        _follow(engine, request)
         if request.error is not None:
             raise ChildProcessError(str(request.error))
         _fill(result, frame, view)
@@ -160,14 +140,7 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
     return request
 
 
-def _follow(
-    engine: bpy.types.RenderEngine,
-    request: ChildRequest,
-    result: bpy.types.RenderResult,
-    frame: Frame,
-    view: PinholeView,
-) -> None:
-    shown_rows, shown_at = 0, time.monotonic()
+def _follow(engine: bpy.types.RenderEngine, request: ChildRequest) -> None:
     while not request.finished:
         if engine.test_break():
             request.cancel()
@@ -176,10 +149,6 @@ def _follow(
             continue
         engine.update_stats("", _stats(request))
         engine.update_progress(request.fraction)
-        if not bpy.app.background and request.step > shown_rows and time.monotonic() - shown_at > SHOW_S:
-            _fill(result, frame, view)
-            engine.update_result(result)
-            shown_rows, shown_at = request.step, time.monotonic()
 
 
 def _stats(request: ChildRequest) -> str:

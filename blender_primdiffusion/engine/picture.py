@@ -82,7 +82,7 @@ class SceneContent:
 def scene_content(
     depsgraph: bpy.types.Depsgraph, solids: Path | None, space: bpy.types.SpaceView3D | None = None
 ) -> SceneContent:
-    """The scene as the dependency graph, or a viewport, shows it, with the file from `solids_file`.
+    """The scene as the dependency graph, or a viewport, shows it, with the file from `stored`.
 
     Raises as `posed_humans` does.
     """
@@ -95,14 +95,6 @@ def scene_content(
         settings.view.lower(),
         settings.step,
     )
-
-
-def solids_file(depsgraph: bpy.types.Depsgraph, folder: Path) -> Path | None:
-    """The scene's solid objects as a file in `folder`; None where there are none or they are ignored."""
-    mode = depsgraph.scene.primdiffusion_render.solids
-    if mode == "IGNORED":
-        return None
-    return stored(scene_solids(depsgraph, mode == "HOLDOUT"), folder)
 
 
 def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:
@@ -207,20 +199,17 @@ class SceneSolids:
     """[F]: cuts a hole into the picture instead of being drawn."""
 
 
-def scene_solids(
-    depsgraph: bpy.types.Depsgraph, everything_holdout: bool, space: bpy.types.SpaceView3D | None = None
-) -> SceneSolids:
+def scene_solids(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> SceneSolids:
     """Visible meshes, curves, surfaces, texts, metaballs and their instances, except the bodies of humans.
 
     A triangle has its material's base colour (see `base_colour`), or without a material the object's. Curves and the
-    like are tessellated by Blender. `everything_holdout` makes all triangles cut holes. Raises ValueError for an object
-    whose corners hold NaN.
+    like are tessellated by Blender. Raises ValueError for an object whose corners hold NaN.
     """
     parts = list(_parts(depsgraph, space))
     if not parts:
         return SceneSolids(np.zeros((0, 3, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, bool))
     corners, colour, holdout = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return SceneSolids(corners, colour, holdout | everything_holdout)
+    return SceneSolids(corners, colour, holdout)
 
 
 def visible_instances(

@@ -1,4 +1,4 @@
-"""From Blender's cameras, matrices and render border to the backend's pinhole camera."""
+"""From Blender's cameras, matrices and render border to the backend's pinhole camera; which engine draws a 3D view."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from ..scene.convention import BLENDER_FROM_BACKEND
 
+ENGINE = "PRIMDIFFUSION"
+WORKBENCH = "BLENDER_WORKBENCH"
+EEVEE = "BLENDER_EEVEE"
 PARALLEL_M = 2000.0
 """An orthographic view is drawn by a pinhole this far from the human: over a body's thickness its scale then varies by
 a ten-thousandth. Farther away, float32 positions along a ray would be coarser than a tenth of a millimetre."""
@@ -38,13 +41,6 @@ class PinholeView:
         """The same view in another resolution."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return dataclasses.replace(self, intrinsics=scale @ self.intrinsics, width=width, height=height)
-
-    def part(self, region: tuple[int, int, int, int]) -> PinholeView:
-        """The view of a part [x, y, width, height], pixels from the left and the bottom."""
-        x, y, width, height = region
-        intrinsics = self.intrinsics.copy()
-        intrinsics[:2, 2] -= x, self.height - y - height
-        return dataclasses.replace(self, intrinsics=intrinsics, width=width, height=height)
 
     def params(self) -> dict[str, object]:
         """Parameters of the child's `draw`."""
@@ -190,3 +186,16 @@ def camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> 
 
 def _corner(render: bpy.types.RenderSettings, which: str) -> tuple[float, float]:
     return getattr(render, f"border_{which}_x"), getattr(render, f"border_{which}_y")
+
+
+def view_engine(engine: str, shading: str) -> str:
+    """The engine that draws a 3D view with this shading, in a scene with this render engine."""
+    return {"RENDERED": engine, "MATERIAL": EEVEE}.get(shading, WORKBENCH)
+
+
+def renders_volumes(engine: str) -> bool:
+    """Whether an engine lights volumes. Engines declare that as Blender's own do: their name is in COMPAT_ENGINES of
+    the panel of a volume's file (in Blender 5.0 to 5.3 Cycles, EEVEE and Hydra Storm). Workbench declares it too, but
+    draws a grey fog."""
+    panel = getattr(bpy.types, "DATA_PT_volume_file", None)
+    return engine in getattr(panel, "COMPAT_ENGINES", ()) and engine not in (WORKBENCH, ENGINE)

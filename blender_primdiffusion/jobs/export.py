@@ -1,10 +1,9 @@
-"""Exports of humans: textured meshes, .human files, 3D Gaussians, VDB sequences, assets; imports of .human files."""
+"""Exports of humans: textured meshes, .human files, 3D Gaussians."""
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,29 +12,17 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
-from ..files.regular_files import exists_in_its_folder, remove_file
 from ..files.whole_files import written_whole
-from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer, RenderAnswer
-from ..formats.joints import JOINT_NAMES
-from ..motion.placing import sample_motion
+from ..formats.answers import GaussiansAnswer, ProxyAnswer
 from ..scene.actions import posed_on
-from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
-from ..scene.blend_values import as_shown
-from ..scene.human import BODY_FILE, PERSON_FILE, HumanTarget, link_part, provenance_of, proxy_of, session_file
+from ..scene.armature import check_joints
+from ..scene.human import HumanTarget, link_part, proxy_of, session_file
 from ..scene.human_file import (
-    CHOOSE_ANOTHER,
-    HumanMotion,
-    compacted,
-    expanded,
-    motion_in,
-    read_human,
     read_tensors,
     reshaped,
     shape_model_of,
-    with_motion,
     write_tensors,
 )
-from ..scene.merged import read_grid, write_grid
 from ..scene.proxy import (
     build_proxy,
     read_proxy,
@@ -45,8 +32,7 @@ from ..scene.proxy import (
 )
 from ..scene.representation import MESH_IN_VIEWPORT, set_representation
 from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
-from .generate import build_person
-from .queue import PREVIEW_PX, Job
+from .queue import Job
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,30 +129,13 @@ def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: I
     return [pose_of(one, np.array(one.matrix_world, np.float64)).params() for one in shown]
 
 
-def write_human(
-    context: bpy.types.Context,
-    person: bpy.types.Object,
-    path: Path,
-    frames: range | None,
-    *,
-    compact: bool = False,
-) -> None:
-    """Write the human with its current shape, and its motion on `frames`; `compact` with 8-bit colours and densities.
-
-    Raises ValueError or OSError.
-
-    The motion is that of the joints in the armature's space, constraints and layers included; the object's own
-    transform is left out.
-    """
+def write_human(person: bpy.types.Object, path: Path) -> None:
+    """Write the human with its current shape. Raises ValueError or OSError."""
     human = read_tensors(session_file(person))
     if has_custom_shape(person):
         betas = betas_of(person)
         human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
-    motion = None
-    if frames is not None:
-        moved, _, _ = sample_motion(context, person, frames)
-        motion = HumanMotion(np.array(frames), moved.rotations, moved.translations, moved.fps)
-    write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
+    write_tensors(path, human)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,159 +165,7 @@ class ExportGaussiansJob(Job):
         return f"Exported {self.target.name} to {self.path.name}: {result.gaussians} Gaussians, {size:.1f} MB"
 
 
-@dataclasses.dataclass(frozen=True)
-class ExportVdbSequenceJob(Job):
-    """Write a human as one grid for each frame, in world space."""
-
-    kind = "export_vdb_sequence"
-    method = "merge_frames"
-
-    target: HumanTarget
-    folder: Path
-    stem: str
-    people: list[dict[str, Any]]
-    """Parameters of `draw`, an entry for each frame."""
-    first: int
-    """The first frame's number."""
-    voxel: float
-
-    @property
-    def label(self) -> str:
-        return f"Export {len(self.people)} VDB files of {self.target.name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        file = self.target.file_now()
-        people = [{**person, "human": file} for person in self.people]
-        return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
-
-    def finish(self, _context: bpy.types.Context, result: MergeFramesAnswer, folder: Path) -> str:
-        written = []
-        for index, grid in enumerate(result.files):
-            name = f"{self.stem}_{self.first + index:04d}.vdb"
-            write_grid(read_grid(grid), folder / name)
-            remove_file(grid, grid.parent)
-            written.append(folder / name)
-        size = sum(path.stat().st_size for path in written) / 1e6
-        for path in written:
-            put(path, self.folder / path.name)
-        return f"Exported {len(written)} frames of {self.target.name} to {self.folder.name}: {size:.0f} MB"
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportHumanJob(Job):
-    """Add the human of a .human file, with its motion if any."""
-
-    kind = "import_human"
-    method = "open_human"
-    undo = "Import Human"
-
-    path: str
-    at: tuple[float, float, float] | None = None
-    """Location of the human, metres; None for the world's origin."""
-
-    @property
-    def label(self) -> str:
-        return f"Import {Path(self.path).name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}
-
-    def result_here(self, folder: Path) -> HumanAnswer | None:
-        return opened(Path(self.path), folder)
-
-    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
-        motion = motion_in(read_tensors(Path(self.path), CHOOSE_ANOTHER), Path(self.path).name)
-        person, notice = build_person(context, result, "Imported", name_of(self.path))
-        if motion is not None:
-            _move(person, motion)
-        if self.at is not None:
-            person.location.xy = self.at[:2]
-            person.location.z += self.at[2]
-        return notice
-
-
-def opened(source: Path, folder: Path) -> HumanAnswer | None:
-    """Write the human of a file, without a motion, into `folder`, and the file of its body where it has one.
-
-    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
-    and files of other kinds. Raises ValueError for a damaged human, OSError.
-    """
-    began = time.monotonic()
-    try:
-        human = read_tensors(source)
-    except ValueError:
-        return None
-    body = source.with_name(BODY_FILE) if "body" in human.metadata else None
-    if body is not None and not exists_in_its_folder(body):
-        return None
-    read_human(source, CHOOSE_ANOTHER)
-    write_tensors(folder / PERSON_FILE, with_motion(human, None))
-    if body is not None:
-        shutil.copyfile(body, folder / BODY_FILE)
-    return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
-
-
-def name_of(path: str) -> str:
-    """The name for the human of this file."""
-    name = Path(path).name
-    for ending in (".safetensors", ".human"):
-        name = name.removesuffix(ending)
-    return name or "Human"
-
-
 def put(source: Path, target: Path) -> None:
     """Copy a finished file to its destination, where it appears whole. Raises OSError."""
     with written_whole(target) as unfinished:
         shutil.copyfile(source, unfinished)
-
-
-def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:
-    if len(motion.frames) == 1:
-        pose_from_joint_rotations(armature, motion.rotations[0], motion.translations[0])
-        return
-    keyframe_poses(
-        armature, np.asarray(motion.frames, np.float64), motion.rotations, motion.translations, armature.name
-    )
-
-
-_PICTURE, _SIDE = "asset.png", 256
-_ARMS_DOWN = 1.15
-"""Radians from the T pose, so that a human fills the picture."""
-
-
-@dataclasses.dataclass(frozen=True)
-class HumanAssetJob(Job):
-    """Draw a picture, then mark the human as an asset. Blender draws none of an armature."""
-
-    kind = "human_asset"
-    method = "render"
-    undo = "Mark Human as Asset"
-
-    target: HumanTarget
-
-    @property
-    def label(self) -> str:
-        return f"Picture of {self.target.name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        pose = np.zeros((len(JOINT_NAMES), 3))
-        pose[JOINT_NAMES.index("left_shoulder"), 2] = -_ARMS_DOWN
-        pose[JOINT_NAMES.index("right_shoulder"), 2] = _ARMS_DOWN
-        human, out = str(session_file(self.target.found())), str(folder / _PICTURE)
-        return {"human": human, "out": out, "pose": pose.ravel().tolist(), "width": _SIDE, "height": _SIDE}
-
-    def finish(self, _context: bpy.types.Context, _result: RenderAnswer, folder: Path) -> str:
-        person = self.target.found()
-        made = provenance_of(person)
-        asked = made.get("attributes")
-        asked = asked if isinstance(asked, dict) else {}
-        seed = f"seed {as_shown(made['seed'])}" if "seed" in made else "no seed"
-        said = [f"{as_shown(name)} {as_shown(value)}" for name, value in asked.items()]
-        person.asset_mark()
-        about = person.asset_data
-        about.description = ", ".join(["Generated human", seed, *said])
-        for tag in ("human", *(as_shown(value) for value in asked.values() if isinstance(value, str))):
-            about.tags.new(tag, skip_if_exists=True)
-        with bpy.context.temp_override(id=person):
-            bpy.ops.ed.lib_id_load_custom_preview(filepath=str(folder / _PICTURE))
-        return f"{person.name} is an asset now; save the file in a folder of your asset libraries"

@@ -45,8 +45,6 @@ class PictureTask:
     picture: str
     mask: str
     """Empty where the picture has alpha."""
-    mask_label: int
-    """The person's in a mask of several labels; -1: it has none."""
     camera: int
     """Session uid."""
     cameras: Mapping[str, Any]
@@ -56,7 +54,7 @@ class PictureTask:
     """Pose, translation and betas of the human posed over the picture; None to start from a standing one."""
 
     @classmethod
-    def of(cls, context: bpy.types.Context, mask: str, mask_label: int, person: bpy.types.Object | None) -> PictureTask:
+    def of(cls, context: bpy.types.Context, mask: str, person: bpy.types.Object | None) -> PictureTask:
         """The scene's camera with its picture, and `person` as it is posed over it. Raises ValueError."""
         camera = context.scene.camera
         image = picture_of(camera)
@@ -82,15 +80,13 @@ class PictureTask:
         if path is None:
             raise ValueError(f"the picture of camera {camera.name!r} is not a file on this computer: choose it again")
         size = (view.width, view.height)
-        return cls(str(path), mask, mask_label, camera.session_uid, {"camera0000": about}, size, posed)
+        return cls(str(path), mask, camera.session_uid, {"camera0000": about}, size, posed)
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Parameters that both requests have; writes their files into `folder`."""
         params: dict[str, Any] = {"pictures": [self.picture]}
         if self.mask:
             params["masks"] = [self.mask]
-        if self.mask and self.mask_label >= 0:
-            params["mask_label"] = self.mask_label
         if self.posed is None:
             (folder / "cameras.json").write_text(json.dumps(self.cameras), encoding="utf-8")
             params["cameras"] = str(folder / "cameras.json")
@@ -98,7 +94,7 @@ class PictureTask:
             posture = {"format": POSTURE_FORMAT, **self.posed, "cameras": self.cameras}
             (folder / "start.json").write_text(json.dumps(posture), encoding="utf-8")
             params["pose"] = str(folder / "start.json")
-        checkpoint = chosen_checkpoint("checkpoint")
+        checkpoint = chosen_checkpoint()
         return {**params, **({"checkpoint": checkpoint} if checkpoint else {}), "out_dir": str(folder / "fitted")}
 
     def camera_now(self) -> bpy.types.Object | None:

@@ -1,4 +1,4 @@
-"""Jobs that add a new human to the scene, from noise or from captures, and edits, which change one in place."""
+"""Jobs that generate a human, and edits, which change one in place."""
 
 from __future__ import annotations
 
@@ -10,70 +10,57 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
-from ..formats.requests import ReconstructRequest
 from ..scene.build import build_human
 from ..scene.edit import Replaced, replace_person, select_human
 from ..scene.human import HumanTarget, humans, session_file
 from ..scene.place import stand_at_cursor
 from ..scene.representation import in_viewport, representation_of
 from ..scene.volume_nodes import set_folder
-from ..scene.volumes import free_unused_grids
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .volumes import write_or_report
 
-FIRST_HUMAN_SHARE = 0.25
-"""Of a view's height: a scene's first human is framed where no view shows it taller."""
 
-
-def build_person(
-    context: bpy.types.Context, result: HumanAnswer, made: str, name: str = "Human"
-) -> tuple[bpy.types.Object, str]:
+def build_person(context: bpy.types.Context, result: HumanAnswer, made: str) -> tuple[bpy.types.Object, str]:
     """Build the human of the child's `result`; returns them and the message ("Generated in 1.2 s.").
 
     Raises as `build_human` does, and then leaves nothing.
     """
     began = time.monotonic()
-    person = build_human(context, result.person, name)
-    stand_at_cursor(context, person)
-    if context.mode == "OBJECT":  # else the user is posing or painting
-        select_human(context, person)
-        bring_into_view(person, 0.0 if len(humans(context.scene)) > 1 else FIRST_HUMAN_SHARE)
+    person = add_human(context, build_human(context, result.person))
     notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
     return person, " ".join([sentence(notice), *map(sentence, result.warnings)])
 
 
-def bring_into_view(obj: bpy.types.Object, least: float) -> None:
-    """Have the first 3D view frame a selected object, unless a view shows all of it on more than the share `least` of
-    its height, or looks through a camera."""
+def add_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.types.Object:
+    """Have a new human stand at the cursor, selected, and in sight if it is the first; returns it."""
+    stand_at_cursor(context, person)
+    if context.mode == "OBJECT":  # else the user is posing or painting
+        select_human(context, person)
+        if len(humans(context.scene)) == 1:
+            frame_in_view()
+    return person
+
+
+def frame_in_view() -> None:
+    """Have the first 3D view frame what is selected, unless a view looks through a camera."""
     if bpy.app.background:
         return
     bpy.context.view_layer.update()
     views = [
-        (window, area, area.spaces.active.region_3d)
+        (window, area)
         for window in bpy.context.window_manager.windows
         for area in window.screen.areas
         if area.type == "VIEW_3D" and area.spaces.active.local_view is None
     ]
-    if not views or any(around.view_perspective == "CAMERA" for *_, around in views):
+    if not views or any(area.spaces.active.region_3d.view_perspective == "CAMERA" for _, area in views):
         return
-    if not any(share_of_height(around.perspective_matrix, obj) > least for *_, around in views):
-        window, area, _ = views[0]
-        region = next(region for region in area.regions if region.type == "WINDOW")
-        with bpy.context.temp_override(window=window, area=area, region=region):
-            bpy.ops.view3d.view_selected()
-
-
-def share_of_height(perspective: Matrix, obj: bpy.types.Object) -> float:
-    """The share of a view's height that an object's bounding box takes; 0 where the view does not show all of it."""
-    clip = [perspective @ (obj.matrix_world @ Vector(corner)).to_4d() for corner in obj.bound_box]
-    if min(corner.w for corner in clip) <= 0:
-        return 0.0
-    seen = np.array([(corner.x / corner.w, corner.y / corner.w) for corner in clip])
-    return 0.0 if np.abs(seen).max() > 1 else float(np.ptp(seen[:, 1])) / 2
+    window, area = views[0]
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.view3d.view_selected()
 
 
 _STEP_PICTURE_PX = 256
@@ -90,7 +77,7 @@ class GenerateJob(Job):
     seed: int
     sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Other fields of `GenerateRequest`: steps, sampler, attributes, guidance."""
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+    checkpoint: str = dataclasses.field(default_factory=chosen_checkpoint)
     next_seed: int | None = None
     """What the panel's seed becomes with this human; None where it was not used, or is locked."""
 
@@ -110,43 +97,12 @@ class GenerateJob(Job):
         return notice
 
 
-@dataclasses.dataclass(frozen=True)
-class ReconstructJob(Job):
-    """Human from Captures."""
-
-    kind = method = "reconstruct"
-    undo = "Human from Captures"
-
-    capture: str
-    """Folder of a dataset of captures, or of one subject in it."""
-    subject: str
-    """Empty for the only one."""
-    frame: int
-    views: int
-    by: str = ReconstructRequest.by
-
-    @property
-    def label(self) -> str:
-        return f"Human from Captures, {self.subject or Path(self.capture).name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        params: dict[str, Any] = {"capture": self.capture, "frame": self.frame, "views": self.views, "by": self.by}
-        checkpoint = chosen_checkpoint("encoder" if self.by == "encoder" else "checkpoint")
-        optional = {"subject": self.subject, "checkpoint": checkpoint}
-        return {**params, **{k: v for k, v in optional.items() if v}, "out_dir": str(folder)}
-
-    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
-        return build_person(context, result, "Reconstructed")[1]
-
-
 def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: HumanAnswer) -> Replaced:
     """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
     done = replace_person(person, result.person)
     if representation_of(person) == "VOLUMES" and in_viewport(person):
         write_or_report(person)
         set_folder(person, session_file(person).parent, again=True)
-        context.view_layer.update()  # evaluated data holds the old grids
-        free_unused_grids()
     return done
 
 
@@ -167,7 +123,7 @@ class EditJob(Job):
     target: HumanTarget
     asked: Mapping[str, Any]
     """Fields of the request. A region {"painted": [V numbers]} holds weights, and travels as a file."""
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+    checkpoint: str = dataclasses.field(default_factory=chosen_checkpoint)
 
     @classmethod
     def of(cls, method: str, person: bpy.types.Object, asked: Mapping[str, Any]) -> EditJob:

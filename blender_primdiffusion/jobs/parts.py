@@ -14,7 +14,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..files.regular_files import printable
-from ..scene.build import STAND_IN, build_missing_parts
+from ..scene.build import build_missing_parts
 from ..scene.human import BODY_MARK, PROXY_MARK, all_humans
 from ..scene.merged import MARK as MERGED_MARK
 from ..scene.splats import CELLS_MARK, SPLATS_AVAILABLE, SPLATS_MARK, cloud_of
@@ -106,7 +106,7 @@ def unregister() -> None:
         bpy.app.timers.unregister(tick)
 
 
-_MARKS = (BODY_MARK, PROXY_MARK, VOLUMES_MARK, STAND_IN, MERGED_MARK, SPLATS_MARK, CELLS_MARK)
+_MARKS = (BODY_MARK, PROXY_MARK, VOLUMES_MARK, MERGED_MARK, SPLATS_MARK, CELLS_MARK)
 """Custom properties of parts."""
 
 

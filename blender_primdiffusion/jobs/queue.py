@@ -19,7 +19,7 @@ from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
 from ..files.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
-from .remedies import defect_in_the_scene, error_in_the_scene, write_error_log
+from .error_log import defect_in_the_scene, error_in_the_scene, write_error_log
 
 PREVIEW_PX = 16
 """Of the child's previews, which most jobs do not use."""
@@ -65,20 +65,19 @@ class Job(abc.ABC):
         return False
 
 
-def chosen_checkpoint(name: str) -> str:
-    """The file of the preference `checkpoint` or `encoder`; empty for the bundled one.
+def chosen_checkpoint() -> str:
+    """The file of the preference `checkpoint`; empty for the bundled one.
 
     Raises ValueError for a path that depends on the open .blend or the working directory.
     """
-    chosen = preference(name)
+    chosen = preference("checkpoint")
     if chosen and not is_local_path(chosen):
-        raise ValueError(NOT_ABSOLUTE.format(f"a {name}", chosen[:200]))
+        raise ValueError(NOT_ABSOLUTE.format("a checkpoint", chosen[:200]))
     return chosen
 
 
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
-_REMEMBERED = 5
 
 
 @dataclasses.dataclass
@@ -127,8 +126,6 @@ class Queue:
         self.outcomes: dict[str, JobOutcome] = {}
         """The last of each kind of job, for the panels."""
         self.last: JobOutcome | None = None
-        self.ended: collections.deque[JobOutcome] = collections.deque(maxlen=_REMEMBERED)
-        """The last of any kind, the latest first."""
         self.child_message = ""
         """How the child ended between jobs; empty when it did not."""
         self.idle_since = time.monotonic()
@@ -226,13 +223,12 @@ class Queue:
                 return True
         return False
 
-    def release(self) -> int | None:
-        """End the idle child; returns its process id, None where there was none or it is running a job."""
-        pid = self.child_pid
-        if pid is None or self.request is not None:
-            return None
+    def release(self) -> bool:
+        """End the idle child; whether there was one."""
+        if self.child_pid is None or self.request is not None:
+            return False
         self._backend.release()
-        return pid
+        return True
 
     def drop(self) -> None:
         """Drop all jobs and end the child."""
@@ -248,7 +244,6 @@ class Queue:
         """End the child and forget all jobs: the extension is being disabled."""
         self.drop()
         self.outcomes.clear()
-        self.ended.clear()
         self.last = None
 
     @property
@@ -280,7 +275,6 @@ class Queue:
         if outcome.error is not None:
             write_error_log(outcome.entry.job.label, outcome.error, self.info, self.log)
         self.outcomes[outcome.entry.job.kind] = self.last = outcome
-        self.ended.appendleft(outcome)
         self.current = self.request = None
         self.idle_since = time.monotonic()
         self._clear_folder()

@@ -46,11 +46,9 @@ class Sheet:
     def __init__(self) -> None:
         self.variations: list[Variation] = []
         self.title = ""
-        self.around = False
-        """They are variants of one human."""
         self._folder: Path | None = None
 
-    def fill(self, people: Sequence[VariationFiles], title: str, *, around: bool = False) -> None:
+    def fill(self, people: Sequence[VariationFiles], title: str) -> None:
         """Move the files of the child's `people` here, replacing those before. Raises OSError before any change."""
         folder = Path(tempfile.mkdtemp(prefix="variation_sheet_", dir=bpy.app.tempdir or None))
         made = []
@@ -67,13 +65,13 @@ class Sheet:
             remove_folder(folder, folder.parent)
             raise
         self.clear()
-        self.variations, self.title, self.around, self._folder = made, title, around, folder
+        self.variations, self.title, self._folder = made, title, folder
 
     def clear(self) -> None:
         """Remove all variations and their files."""
         if self._folder is not None:
             remove_folder(self._folder, self._folder.parent)
-        self.variations, self.title, self.around, self._folder = [], "", False, None
+        self.variations, self.title, self._folder = [], "", None
 
     def chosen(self) -> list[Variation]:
         """The selected ones. Raises ValueError for none."""
@@ -102,7 +100,7 @@ class VariationsJob(Job):
     """File of the human to vary; empty for new humans."""
     amount: float = 0.5
     title: str = "New humans"
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+    checkpoint: str = dataclasses.field(default_factory=chosen_checkpoint)
 
     @property
     def label(self) -> str:
@@ -119,6 +117,6 @@ class VariationsJob(Job):
         return {**params, "size": PICTURE_PX, "out_dir": str(folder)}
 
     def finish(self, _context: bpy.types.Context, result: VariationsAnswer, _folder: Path) -> str:
-        sheet.fill(result.people, self.title, around=bool(self.person))
+        sheet.fill(result.people, self.title)
         icons.free()  # of the steps
         return " ".join([f"{len(self.seeds)} humans in {result.seconds:.1f} s.", *map(sentence, result.warnings)])

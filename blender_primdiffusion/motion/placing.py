@@ -14,8 +14,8 @@ from ..formats.joints import JOINT_NAMES
 from ..formats.poses.motion import Motion
 from ..formats.poses.rotation import from_quaternion, matrix_to_quaternion, nearest, slerp
 from ..formats.poses.skeleton import REST_JOINTS, joint_positions, unchain
-from ..scene.actions import last_key, posed_on, push_to_strip
-from ..scene.armature import append_poses, keyframe_poses, model_origin, rest_rotations
+from ..scene.actions import posed_on
+from ..scene.armature import keyframe_poses, model_origin, rest_rotations
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import BLENDER_FROM_BACKEND, continuous_quaternions, points_to_backend
 from ..scene.handles import check_no_handles
@@ -41,17 +41,15 @@ _MOST_SAMPLES = 3000
 """The first samples of longer motions are enough."""
 
 
-def cut(motion: Motion, first: int = 1, last: int = 0, stride: int = 1) -> Motion:
-    """Every `stride`-th of the frames `first` to `last` of the file, inclusive, counted from 1; 0 is the last one.
+def cut(motion: Motion, first: int = 1, last: int = 0) -> Motion:
+    """The frames `first` to `last` of the file, inclusive, counted from 1; 0 is the last one.
 
     Raises ValueError where no frame is left.
     """
     end = len(motion) if last <= 0 else min(last, len(motion))
     if not 1 <= first <= end:
         raise ValueError(f"there are no frames {first} to {last or end} in {len(motion)} frames: choose existing ones")
-    if stride < 1:
-        raise ValueError(f"the stride is {stride}: give 1 or more")
-    return dataclasses.replace(motion.frames(np.arange(first - 1, end, stride)), fps=motion.fps / stride)
+    return motion.frames(np.arange(first - 1, end))
 
 
 def resample(motion: Motion, fps: float) -> Motion:
@@ -166,64 +164,44 @@ class Placement:
     """How a motion is to be put onto an armature."""
 
     start: float = 1.0
-    """Frame of the first key; ignored for APPEND, which begins a frame after the last key."""
-    timing: str = "SCENE"
-    """SCENE: a key on every frame of the scene; SOURCE: one for every frame of the motion."""
+    """Frame of the first key."""
     first: int = 1
     """Frame of the motion, counted from 1."""
     last: int = 0
     """The same; 0 is the last there is."""
-    stride: int = 1
-    scale: float = 1.0
-    """Factor on the path."""
     fit_stride: bool = True
-    """Whether the path is scaled to the armature's legs, before `scale`."""
+    """Whether the path is scaled to the armature's legs."""
     root: str = "ORIGIN"
     """ORIGIN: the path begins at the human; KEEP: it stays as in the file; PLACE: the human stays in place."""
     ground: bool = True
     """Whether the whole motion is moved onto the floor."""
-    into: str = "NEW"
-    """NEW: an action; APPEND: to the one there is; STRIP: a strip of the nonlinear animation."""
 
 
 def place_motion(
     context: bpy.types.Context, armature: bpy.types.Object, motion: Motion, how: Placement
 ) -> tuple[float, float]:
-    """Set the keys; returns the first and last frame. Raises ValueError before anything is changed."""
+    """Key the motion in a new action, on every frame of the scene; returns the first and last frame.
+
+    Raises ValueError before anything is changed.
+    """
     check_posable(armature)
     check_no_handles(armature)
     rest = rest_joints(armature)
     ratio = stride_ratio(motion, rest) if how.fit_stride else None
-    way = dataclasses.replace(how, scale=how.scale * (1.0 if ratio is None else ratio))
-    fitted, times = fit(motion, rest, scene_fps(context.scene), way)
-    start = how.start
-    if how.into == "APPEND":
-        end = last_key(armature)
-        start = end + 1.0 if np.isfinite(end) else how.start
-    frames = start + times
-    if how.into == "APPEND":
-        append_poses(armature, frames, fitted.rotations, fitted.translations)
-        action = armature.animation_data.action
-    else:
-        action = keyframe_poses(armature, frames, fitted.rotations, fitted.translations, motion.name)
-        action.use_fake_user = True
+    fitted = fit(motion, rest, scene_fps(context.scene), how, 1.0 if ratio is None else ratio)
+    frames = how.start + np.arange(len(fitted))
+    action = keyframe_poses(armature, frames, fitted.rotations, fitted.translations, motion.name)
+    action.use_fake_user = True
     action[FACTS] = json.dumps({**facts(motion), "Stride": "as in the file" if ratio is None else f"x {ratio:.2f}"})
-    if how.into == "STRIP":
-        push_to_strip(armature)
     return float(frames[0]), float(frames[-1])
 
 
-def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement) -> tuple[Motion, NDArray[np.float64]]:
-    """The motion fitted to a skeleton at rest [24, 3], and its frames in the scene [F], from 0."""
-    fitted = cut(motion, how.first, how.last, how.stride)
-    if how.timing == "SCENE":
-        fitted = resample(fitted, scene_rate)
-    fitted = scale_places(fitted, how.scale)
+def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement, scale: float) -> Motion:
+    """The motion, with a frame for each of the scene's, on a skeleton at rest [24, 3]; `scale` is for its path."""
+    fitted = scale_places(resample(cut(motion, how.first, how.last), scene_rate), scale)
     if how.root != "KEEP":
         fitted = in_place(fitted) if how.root == "PLACE" else from_origin(fitted)
-    if how.ground:
-        fitted = on_floor(fitted, rest)
-    return fitted, np.arange(len(fitted)) * (scene_rate / fitted.fps)
+    return on_floor(fitted, rest) if how.ground else fitted
 
 
 def facts(motion: Motion) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""An armature's action: its curves, its end, looping, pushing it down to an NLA strip; what it shows on each frame."""
+"""An armature's action: its curves and frames, and what it shows on each."""
 
 from __future__ import annotations
 
@@ -7,18 +7,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import bpy
-
-
-def push_to_strip(armature: bpy.types.Object) -> bpy.types.NlaStrip:
-    """Move the armature's action to a strip on a new track above the others (the NLA's Push Down)."""
-    animation = armature.animation_data
-    action, slot = animation.action, animation.action_slot
-    track = animation.nla_tracks.new()
-    track.name = action.name
-    strip = track.strips.new(action.name, round(action.frame_range[0]), action)
-    strip.action_slot = slot
-    animation.action = None
-    return strip
 
 
 def action_curves(armature: bpy.types.Object) -> bpy.types.bpy_prop_collection | None:
@@ -70,34 +58,6 @@ def frames_in_use(armature: bpy.types.Object) -> range:
     strips = [strip for track in animation.nla_tracks if not track.mute for strip in track.strips if not strip.mute]
     times += [time for strip in strips for time in (strip.frame_start, strip.frame_end)]
     return range(math.floor(min(times)), math.ceil(max(times)) + 1) if times else range(0)
-
-
-def last_key(armature: bpy.types.Object) -> float:
-    """The frame of the last key of the armature's action; minus infinity without keys."""
-    ends = [curve.keyframe_points[-1].co[0] for curve in action_curves(armature) or () if len(curve.keyframe_points)]
-    return max(ends, default=float("-inf"))
-
-
-def loops(armature: bpy.types.Object) -> bool:
-    """Whether the action loops (see `repeat`)."""
-    return any(modifier.type == "CYCLES" for curve in action_curves(armature) or () for modifier in curve.modifiers)
-
-
-def repeat(armature: bpy.types.Object) -> None:
-    """Loop the action before and after its range: rotations start again, locations continue from where they were."""
-    for curve in action_curves(armature) or ():
-        if not any(modifier.type == "CYCLES" for modifier in curve.modifiers):
-            cycles = curve.modifiers.new("CYCLES")
-            cycles.mode_before = cycles.mode_after = (
-                "REPEAT_OFFSET" if curve.data_path.endswith("location") else "REPEAT"
-            )
-
-
-def end_repeat(armature: bpy.types.Object) -> None:
-    """Undo `repeat`."""
-    for curve in action_curves(armature) or ():
-        for modifier in [modifier for modifier in curve.modifiers if modifier.type == "CYCLES"]:
-            curve.modifiers.remove(modifier)
 
 
 @contextmanager

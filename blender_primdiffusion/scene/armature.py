@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.rotation import matrix_to_quaternion
-from .actions import action_curves, last_key, new_action
+from .actions import action_curves, new_action
 from .blend_values import stored_numbers
 from .convention import continuous_quaternions, points_to_blender, rotations_to_blender
 from .human import ORIGIN
@@ -196,35 +196,6 @@ def keyframe_poses(
         add_keys(curves.new(path, index=index), frames, values)
     _use_quaternions(armature)
     return action
-
-
-def append_poses(armature: bpy.types.Object, frames: NDArray, rotations: NDArray, translations: NDArray) -> None:
-    """Append keys to the armature's action; arguments and errors as for `keyframe_poses`.
-
-    Also raises ValueError where the armature has no action, or one that is linked or has keys at or after the first of
-    `frames`.
-    """
-    channels = _channels(armature, frames, rotations, translations)
-    curves = action_curves(armature)
-    action = armature.animation_data.action if armature.animation_data else None
-    if action is None or curves is None:
-        raise ValueError(f"{armature.name!r} has no motion to append to: import it as a new action")
-    if action.library is not None:
-        raise ValueError(f"the action {action.name!r} is linked from another file: import into a new action")
-    end = last_key(armature)
-    if end >= frames[0]:
-        raise ValueError(f"the action {action.name!r} continues until frame {end:g}: start later than that")
-    existing = {(curve.data_path, curve.array_index): curve for curve in curves}
-    for bone in JOINT_NAMES:
-        path = f'pose.bones["{bone}"].rotation_quaternion'
-        keys = [(path, component) for component in range(4)]
-        last = [existing[key].keyframe_points[-1].co[1] if key in existing else float(key[1] == 0) for key in keys]
-        if sum(value * channels[key][0] for key, value in zip(keys, last, strict=True)) < 0:
-            for key in keys:  # q and -q are the same rotation, but Blender interpolates components
-                channels[key] = -channels[key]
-    for key, values in channels.items():
-        add_keys(existing[key] if key in existing else curves.new(key[0], index=key[1]), frames, values)
-    _use_quaternions(armature)
 
 
 def _channels(

@@ -1,10 +1,4 @@
-"""Build a human in the scene: an armature with body mesh, and splats or volumes, as its children; before Blender 5.3
-also what a Blender without the extension shows of it.
-
-That is the body mesh with a name that says what is missing. Whether viewports hide it is driven by a property that the
-extension registers on scenes; where it is not registered, the driver has its fallback value. So nothing is switched
-when files are saved and loaded, and no script runs.
-"""
+"""Build a human in the scene: an armature with body mesh, and splats or volumes, as its children."""
 
 from __future__ import annotations
 
@@ -21,7 +15,7 @@ from ..formats.joints import JOINT_NAMES
 from .armature import build_armature, floor_below
 from .convention import points_to_blender
 from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part, pack
-from .human_file import read_human, shape_model_of
+from .human_file import GENERATE_AGAIN, read_human, shape_model_of
 from .representation import set_representation
 from .shape import betas_of
 from .splats import SPLATS_AVAILABLE
@@ -36,7 +30,9 @@ _KINDS = (
 )  # fmt: skip
 
 
-def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human") -> bpy.types.Object:
+def build_human(
+    context: bpy.types.Context, file: str | Path, name: str = "Human", remedy: str = GENERATE_AGAIN
+) -> bpy.types.Object:
     """Build the human of a file in a collection of their own: an armature that holds the file, and its parts.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
@@ -44,7 +40,7 @@ def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human
     no data. Makes no undo step.
     """
     file = Path(file)
-    human = read_human(file)
+    human = read_human(file, remedy)
     with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:NAME_LENGTH])
         origin = floor_below(points_to_blender(human.rest.vertices))
@@ -72,15 +68,12 @@ def build_missing_parts(person: bpy.types.Object) -> None:
 
 
 def _build_body(person: bpy.types.Object) -> None:
-    """The hidden body mesh, and what stands in for the human in a Blender without the extension."""
+    """The hidden body mesh."""
     model = shape_model_of(person)
     vertices = points_to_blender(model.surface(betas_of(person)))
     vertices += floor_below(vertices)
     label = f"{person.name}_body"
-    body = build_body_mesh(label, person, vertices, model.faces, model.uv_corner, model.skin_weights)
-    link_part(person, body)
-    if not SPLATS_AVAILABLE:  # they show without the extension
-        link_part(person, build_stand_in(person.name, person, body))
+    link_part(person, build_body_mesh(label, person, vertices, model.faces, model.uv_corner, model.skin_weights))
 
 
 @contextmanager
@@ -146,58 +139,3 @@ def _by_weight(weights: NDArray) -> Iterator[tuple[list[int], float]]:
     alike = vertices.tolist()
     for start, end in itertools.pairwise([*starts, len(alike)]):
         yield alike[start:end], float(ordered[start])
-
-
-STAND_IN = "primdiffusion_stand_in"
-"""Custom property of such an object."""
-PRESENT = "primdiffusion_present"
-"""Property of scenes while the extension is enabled; its value is never set."""
-_LABEL = "needs_PrimDiffusion"
-
-PROPERTIES = (
-    (
-        bpy.types.Scene,
-        PRESENT,
-        bpy.props.BoolProperty(
-            name="PrimDiffusion", description="The extension is enabled", default=True, options={"HIDDEN"}
-        ),
-    ),
-)
-
-
-def build_stand_in(label: str, armature: bpy.types.Object, body: bpy.types.Object) -> bpy.types.Object:
-    """The object, linked to no collection: the mesh of `body` on the armature, never rendered."""
-    made = bpy.data.objects.new(f"{label}_{_LABEL}", body.data)
-    made[STAND_IN] = True
-    made.parent = armature
-    modifier = made.modifiers.new("Armature", "ARMATURE")
-    modifier.object = armature
-    modifier.use_deform_preserve_volume = False
-    made.show_name = True
-    made.hide_viewport = made.hide_render = True
-    driver = made.driver_add("hide_viewport").driver
-    driver.type = "SUM"
-    variable = driver.variables.new()
-    variable.type = "CONTEXT_PROP"
-    (target,) = variable.targets
-    target.context_property = "ACTIVE_SCENE"
-    target.data_path = PRESENT
-    target.use_fallback_value = True
-    target.fallback_value = 0.0
-    return made
-
-
-def register() -> None:
-    """Hide what stands in for humans of the open file, when the extension is enabled."""
-    _evaluate()
-
-
-def unregister() -> None:
-    """Show it again."""
-    _evaluate()
-
-
-def _evaluate() -> None:
-    for obj in getattr(bpy.data, "objects", ()):  # not while Blender starts
-        if STAND_IN in obj:
-            obj.update_tag()

@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Quaternion, Vector
 
-from .actions import action_curves, frames_in_use, loops, own_curves, posed_on, repeat
+from .actions import action_curves, frames_in_use, own_curves, posed_on
 from .armature import CONTROLS, LIMBS, POLE_M, Limb, editing_bones, place_controls, rest_rotations
 
 COLLECTION = "IK Handles"
@@ -165,7 +165,6 @@ def _pose_on(
     armature: bpy.types.Object, frames: range, poses: Sequence[Callable[[], None]], keys: Mapping[str, Sequence[str]]
 ) -> None:
     """Take each pose and key these properties of bones on its frame, in place of their keys; or take the only one."""
-    looped = loops(armature)
     if frames:
         own_curves(armature)
         _remove_curves(armature, keys)
@@ -174,8 +173,6 @@ def _pose_on(
         for name, channels in keys.items() if frames else ():
             for channel in channels:
                 armature.pose.bones[name].keyframe_insert(channel, frame=frames[number], group=name)
-    if looped:
-        repeat(armature)
 
 
 def _remove_curves(armature: bpy.types.Object, keys: Mapping[str, Sequence[str]]) -> None:

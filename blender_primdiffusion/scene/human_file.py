@@ -1,8 +1,7 @@
-""".human files: a human as the backend saves it (safetensors), with its current shape and its motion; and what a file
-holds, a human at rest on its body: the default one, or the one in a file beside it.
+""".human files: a human as the backend saves it (safetensors); and what a file holds, a human at rest on its body: the
+default one, or the one in a file beside it.
 
-The backend reads them as it reads its own files; the motion is stored under additional names (`motion.*`). Both find
-tensors in a file by `files.tensor_layout`; numpy is enough to read and write them.
+Both programs find tensors in a file by `files.tensor_layout`; numpy is enough to read and write them.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.arrays import MOST_BODY_VALUES, all_finite, check_shapes, read_arrays
-from ..files.json_files import parse_json
 from ..files.regular_files import FileError, as_file_error, exists_in_its_folder, read_regular
 from ..files.tensor_layout import DTYPES, LENGTH_BYTES, read_layout
 from ..files.whole_files import written_whole
@@ -27,20 +25,16 @@ from ..formats.body_layout import body_data, half_extents, stencils
 from ..formats.body_layout import read_layout as read_body_layout
 from ..formats.human_layout import (
     COMPACT_SCALES,
-    COMPACT_VERSION,
     LARGEST_VALUE,
     from_eight_bits,
     provenance_of,
-    to_eight_bits,
     version_fault,
 )
-from ..formats.poses.rotation import first_improper, improper_text
 from .human import BETA_COUNT, BODY_FILE, LARGEST_BETA, LARGEST_PERSON, session_file
 from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
 from .volumes import Grids, bake
 
 _METADATA = "__metadata__"
-_MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
 _EIGHT_BIT = ("rgb", "density")
 """Arrays that compact files hold in eight bits."""
 _FLOATS = ("F64", "F32", "F16", "BF16")
@@ -52,19 +46,6 @@ GENERATE_AGAIN = "generate the human again"
 """What to do about a damaged file of a human in the scene, or of one that the backend has just written."""
 CHOOSE_ANOTHER = "choose a .human file, or export the human again"
 """What to do about one that the user has chosen."""
-
-
-@dataclasses.dataclass(frozen=True)
-class HumanMotion:
-    """How the human moves; one frame is a pose."""
-
-    frames: NDArray[np.float32]
-    """Frame numbers [F], increasing."""
-    rotations: NDArray[np.float32]
-    """Joint rotations [F, 24, 3, 3], y up."""
-    translations: NDArray[np.float32]
-    """[F, 3], metres, y up."""
-    fps: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,22 +148,8 @@ def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> Hum
     return HumanTensors(human.metadata, arrays)
 
 
-def compacted(human: HumanTensors) -> HumanTensors:
-    """The human with 8-bit colours and densities, a quarter of the size. Raises ValueError for a damaged file."""
-    if COMPACT_SCALES in human.metadata:
-        return human
-    with as_file_error("the human's file", "is damaged", GENERATE_AGAIN):
-        rgb, density, scales = to_eight_bits(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
-    arrays = {
-        name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
-    }
-    version = str(COMPACT_VERSION)
-    metadata = {**human.metadata, "format_version": version, COMPACT_SCALES: scales}
-    return HumanTensors(metadata, {**human.arrays, **arrays})
-
-
 def expanded(human: HumanTensors) -> HumanTensors:
-    """The inverse of `compacted`, up to rounding. Raises ValueError or KeyError for a damaged file."""
+    """A compact file's human with colours and densities as floats. Raises ValueError or KeyError for a damaged one."""
     if COMPACT_SCALES not in human.metadata:
         return human
     metadata = {name: text for name, text in human.metadata.items() if name != COMPACT_SCALES}
@@ -190,37 +157,6 @@ def expanded(human: HumanTensors) -> HumanTensors:
     stored = {name: _loaded(*human.arrays[name]) for name in _EIGHT_BIT}
     floats = from_eight_bits(stored, human.metadata[COMPACT_SCALES])
     return HumanTensors(metadata, {**human.arrays, **{name: _stored(values) for name, values in floats.items()}})
-
-
-def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors:
-    """The human with another motion, or without for None."""
-    metadata = {name: text for name, text in human.metadata.items() if name != "motion"}
-    arrays = {name: array for name, array in human.arrays.items() if name not in _MOTION}
-    if motion is not None:
-        metadata["motion"] = json.dumps({"fps": motion.fps})
-        for name, array in zip(_MOTION, (motion.frames, motion.rotations, motion.translations), strict=True):
-            arrays[name] = _stored(np.asarray(array, np.float32))
-    return HumanTensors(metadata, arrays)
-
-
-def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
-    """The motion in a file of this name, if any. Raises ValueError where it is damaged."""
-    if "motion" not in human.metadata:
-        return None
-    with as_file_error(repr(name), "holds a damaged motion", CHOOSE_ANOTHER):
-        fps = float(parse_json(human.metadata["motion"])["fps"])
-        arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
-    frames = len(arrays[0]) if arrays[0].ndim else 0
-    for array, shape in zip(arrays, _MOTION.values(), strict=True):
-        if array.shape != tuple(frames if s == "F" else s for s in shape) or not all_finite(array):
-            raise FileError(repr(name), "holds a damaged motion", CHOOSE_ANOTHER)
-    if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
-        raise FileError(repr(name), "holds a motion with frames out of order", CHOOSE_ANOTHER)
-    improper = first_improper(arrays[1])
-    if improper is not None:
-        frame = f"{arrays[0][improper[0]]:g}"
-        raise FileError(repr(name), f"holds {improper_text(frame, improper[1])} in its motion", CHOOSE_ANOTHER)
-    return HumanMotion(*arrays, fps)
 
 
 def write_tensors(path: Path, human: HumanTensors) -> None:

@@ -1,9 +1,7 @@
-"""Where a new human stands: at the 3D cursor, or beside the humans and solid objects that are there; and a camera that
-frames humans."""
+"""Where a new human stands: at the 3D cursor, or beside the humans and solid objects that are there."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import bpy
@@ -11,24 +9,19 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from .build import STAND_IN
 from .human import BODY_MARK, PROXY_MARK, humans
 
 GAP_M = 0.2
 """Distance to other humans and to solid objects, metres."""
 REACH_M = 6.0
 """Longest way from the cursor to get clear of solid objects, metres."""
-_FOCAL_MM, _SENSOR_MM = 70.0, 36.0
-"""Of a new camera."""
-_MARGIN = 1.05
-"""Around what the camera frames."""
 _FLESH_M = 0.1
 """Margin around bones, metres."""
 _STEP_M = 0.1
 """Height above the soles of what one stands on: floors, rugs, uneven ground, metres."""
 _SEE_THROUGH = frozenset({"WIRE", "BOUNDS"})
 _SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
-_OF_HUMANS = (BODY_MARK, PROXY_MARK, STAND_IN)
+_OF_HUMANS = (BODY_MARK, PROXY_MARK)
 
 
 def stand_at_cursor(context: bpy.types.Context, person: bpy.types.Object) -> None:
@@ -101,36 +94,3 @@ def _solids(depsgraph: bpy.types.Depsgraph, extent: NDArray) -> Iterator[NDArray
 def is_solid(obj: bpy.types.Object) -> bool:
     """Whether an object has a surface and is no part of a human."""
     return obj.type in _SOLID_TYPES and not any(mark in obj for mark in _OF_HUMANS)
-
-
-def humans_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest corner [3] of all humans in a scene, as posed. Raises ValueError when there are none."""
-    extents = [posed_extent(person) for person in humans(scene)]
-    if not extents:
-        raise ValueError(f"there is no human in the scene {scene.name!r}; add one first")
-    return np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
-
-
-def new_camera(scene: bpy.types.Scene) -> bpy.types.Object:
-    """A camera in the scene, at the origin until `frame_box` places it."""
-    data = bpy.data.cameras.new("Preview Camera")
-    data.lens, data.sensor_width = _FOCAL_MM, _SENSOR_MM
-    camera = bpy.data.objects.new("Preview Camera", data)
-    scene.collection.objects.link(camera)
-    return camera
-
-
-def frame_box(
-    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
-) -> None:
-    """Point the camera at the middle of a box, level, from `yaw` radians, as near as a picture of `size` shows all
-    corners."""
-    low, high = extent
-    right, direction = np.array([math.cos(yaw), math.sin(yaw), 0.0]), np.array([math.sin(yaw), -math.cos(yaw), 0.0])
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2
-    half = np.array(size) / max(size) * (_SENSOR_MM / 2 / camera.data.lens)  # tangents of the half angles of view
-    aside = np.maximum(np.abs(corners @ right) / half[0], np.abs(corners[:, 2]) / half[1]) * _MARGIN
-    distance = float((aside + corners @ direction).max())
-    camera.location = (low + high) / 2 + direction * distance
-    camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
-    camera.data.clip_end = max(100.0, 2 * distance)

@@ -171,14 +171,6 @@ def volume_material() -> bpy.types.Material:
     return material
 
 
-def density_gain() -> bpy.types.NodeSocketFloat | None:
-    """The factor on density in the shared material; None before its first use, and where the user has removed it."""
-    material = bpy.data.materials.get(MATERIAL_NAME)
-    tree = material.node_tree if material is not None else None
-    node = tree.nodes.get(GAIN_NODE) if tree is not None else None
-    return node.outputs[0] if node is not None and node.outputs else None
-
-
 def open_humans() -> list[str]:
     """Point the volumes of all humans to the files of this session; returns what is wrong with humans, in sentences.
 

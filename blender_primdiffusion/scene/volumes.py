@@ -1,11 +1,9 @@
-"""Primitives as VDB files, and Blender's cache of their grids."""
+"""Primitives as VDB files."""
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import os
-import sys
 from pathlib import Path
 
 import bpy
@@ -129,19 +127,3 @@ def write_vdb(
         grid.transform = transform
         grid.saveFloatAsHalf = True
     openvdb.write(str(path), grids=[fog, cd])
-
-
-_LOWEST_LIMIT_MB = 1
-
-
-def free_unused_grids() -> None:
-    """Empty the cache by lowering its limit for a moment, and return the memory to the system where possible."""
-    preferences = bpy.context.preferences
-    was_dirty, limit = preferences.is_dirty, preferences.system.memory_cache_limit
-    preferences.system.memory_cache_limit = _LOWEST_LIMIT_MB
-    preferences.system.memory_cache_limit = limit
-    preferences.is_dirty = was_dirty
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc alone has it
-        if trim is not None:
-            trim(0)

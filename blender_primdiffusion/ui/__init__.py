@@ -13,38 +13,30 @@ from types import ModuleType
 import bpy
 
 from ..jobs import follow, parts, volumes, windows
-from ..scene import build
 from . import (
     advanced_panel,
     captures_panel,
-    captures_settings,
     edit_panel,
-    export_operators,
     export_panel,
     generate_panel,
     generate_settings,
     human_panel,
-    import_motion,
     jobs_panel,
-    manual,
     menus,
     motion_panel,
     picture_panel,
-    pose_panel,
     preferences,
-    reconstruct_panel,
     render_panel,
     shape_panel,
     variations_panel,
-    viewport_humans,
 )
 
 MODULES = (
     *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel,
     generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
-    volumes, import_motion, motion_panel, pose_panel, picture_panel,
-    render_panel, export_operators, export_panel, advanced_panel, captures_settings,
-    captures_panel, reconstruct_panel, viewport_humans, manual, menus, build,
+    volumes, motion_panel, picture_panel,
+    render_panel, export_panel, advanced_panel,
+    captures_panel, menus,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

@@ -1,4 +1,4 @@
-"""The sidebar panel Advanced: splats, volumes or a merged volume, the look in Cycles, facts, the backend."""
+"""The sidebar panel Advanced: splats, volumes or a merged volume, facts."""
 
 from __future__ import annotations
 
@@ -24,10 +24,8 @@ from ..scene.representation import (
     stop_showing,
 )
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
-from ..scene.volume_nodes import density_gain
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
-from .jobs_panel import draw_backend
 from .on_person import HumanOperator
 
 REPRESENTATIONS = (
@@ -44,7 +42,6 @@ REPRESENTATIONS = (
 )
 _NO_MESH = ("NO_MESH", "Remove Mesh Proxy", "Delete the mesh proxy, and show what there was before")
 _MOST_FRAMES = 3_000
-_OVERLAP = "Cycles draws at most 31 volumes at a point, and humans have more in places: merge the human"
 
 
 class PRIMDIFFUSION_OT_set_representation(HumanOperator, bpy.types.Operator):
@@ -160,15 +157,12 @@ class PRIMDIFFUSION_PT_advanced(SidebarPanel, bpy.types.Panel):
     bl_order = 4
     bl_options = {"DEFAULT_CLOSED"}
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return bool(humans(context.scene))
+
     def draw(self, context: bpy.types.Context) -> None:
-        layout = property_columns(self.layout)
-        if humans(context.scene):
-            _draw_person(layout, context)
-        if not backend_is_named():
-            return
-        backend = draw_section(layout, "backend", text="Backend", page="troubleshooting")
-        if backend is not None:
-            draw_backend(backend)
+        _draw_person(property_columns(self.layout), context)
 
 
 def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -181,7 +175,6 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     for name, text, page, section, draw in (
         ("show_as", "Show As", "rendering", "show-as", _draw_representation),
         ("merge", "Merge for Cycles", "rendering", "merge-for-cycles", _draw_merge),
-        ("look", "Cycles Material", "rendering", "cycles-material", _draw_cycles_look),
         ("facts", "Facts", "editing", "facts", _draw_facts),
     ):
         if name == "merge" and not backend_is_named():
@@ -228,20 +221,6 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
         if outdated(person, context.scene):
             draw_lines(layout, "The merged volume is of another pose: merge again to update it", "ERROR")
         layout.operator("primdiffusion.merge", text="Unmerge", icon="X").what = "NOTHING"
-
-
-def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
-    """What brings Cycles near the exact picture."""
-    if representation_of(person) == "SPLATS":
-        draw_lines(layout, "Splats look the same in every engine", "INFO")
-        return
-    gain = density_gain()
-    if gain is None:
-        draw_lines(layout, "The material PrimDiffusion Volume has no node Density Gain", "INFO")
-    else:
-        layout.prop(gain, "default_value", text="Density Gain")
-    if context.scene.render.engine == "CYCLES" and representation_of(person) == "VOLUMES":
-        draw_lines(layout, _OVERLAP, "INFO")
 
 
 def _draw_facts(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:

@@ -1,33 +1,207 @@
-"""The sidebar panel Captures: render, verify, and a preview of the cameras; and the extension's command line,
-`blender -c primdiffusion capture ...`."""
+"""The panel Captures: what it asks for, saved with the scene; the capture that runs in another Blender; and the
+extension's command line, `blender -c primdiffusion capture ...`."""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import shlex
+import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
-import numpy as np
-from mathutils import Vector
-from numpy.typing import NDArray
 
-from ..capture.cameras import aim
-from ..capture.command import main, parse, settings_of
-from ..console import DONE, UNUSABLE
-from ..formats.camera_rig import bounding_sphere
-from ..jobs.follow import Reporting
+from ..backend.child_process import BLENDER, COMPUTING, Output, passed_on
+from ..backend.requests import Step, Steps
+from ..capture.cameras import view_of
+from ..capture.command import MARK, main, parse, settings_of
+from ..capture.settings import CaptureSettings
+from ..console import DONE, UNUSABLE, duration
+from ..files.json_files import parse_message
+from ..files.regular_files import remove_folder
+from ..formats.answers import CapturesProgress
+from ..formats.camera_rig import Rig
+from ..formats.requests import PASSES
+from ..formats.schema import read
+from ..jobs.follow import Reporting, Session
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
-from ..scene.convention import points_to_backend
-from .captures_settings import captures, capturing, command_args
-from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
+from .declared import declared
+from .drawing import SidebarPanel, draw_lines, property_columns
 
-RIG = "Capture Rig"
-_PERSON_M = 1.1
-"""Radius of the sphere around a human in T pose at the world's origin, where nothing is selected."""
+_PASS_NAMES = {
+    "img": ("Colour", "What the camera sees, over black"),
+    "mask": ("Mask", "Coverage of each pixel by the person"),
+    "depth": ("Depth", "Metres along the optical axis, 16 bits"),
+    "normal": ("Normal", "Surface normal in world space"),
+    "part": ("Part", "Which of the 24 joints moves the surface"),
+}
+_PASS_ITEMS = [(kind, *_PASS_NAMES[kind], 1 << i) for i, kind in enumerate(PASSES)]
+
+
+class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_captures`."""
+
+    people: bpy.props.StringProperty(
+        name="People", description="Folder of scans (.glb, .fbx, .obj) or of generated humans", subtype="DIR_PATH"
+    )
+    out: bpy.props.StringProperty(
+        name="Captures", description="Folder of the dataset; an unfinished one is resumed", subtype="DIR_PATH"
+    )
+    body: declared(CaptureSettings, "body")
+    seed: declared(CaptureSettings, "seed")
+    poses: bpy.props.StringProperty(
+        name="Poses",
+        description="A file or folder of AMASS or pose .npz, .npy, .json, .pkl or .bvh; empty: built-in poses",
+        subtype="FILE_PATH",
+    )
+    pose_count: declared(CaptureSettings, "pose_count", name="Pose Count")
+    arrangement: bpy.props.EnumProperty(
+        name="Arrangement",
+        description="Where the cameras stand",
+        items=[
+            ("rings", "Rings", "Rings at several heights"),
+            ("sphere", "Sphere", "Evenly on all sides (Fibonacci)"),
+            ("hemisphere", "Hemisphere", "Evenly from above and the sides"),
+            ("custom", "Cameras of the Scene", "The cameras of a collection, fixed for all people"),
+        ],
+    )
+    camera_count: declared(Rig, "count", name="Cameras")
+    cameras: bpy.props.PointerProperty(
+        name="Collection",
+        description="Collection with the cameras; without one, the selected cameras",
+        type=bpy.types.Collection,
+    )
+    width: declared(Rig, "width", subtype="PIXEL")
+    height: declared(Rig, "height", subtype="PIXEL")
+    passes: bpy.props.EnumProperty(
+        name="Passes",
+        description="Kinds of pictures to write",
+        options={"ENUM_FLAG"},
+        items=_PASS_ITEMS,
+        default=set(PASSES),
+    )
+    samples: declared(CaptureSettings, "samples")
+    light: declared(CaptureSettings, "light")
+    hdri: declared(CaptureSettings, "hdri", name="HDRI")
+    options: bpy.props.StringProperty(
+        name="More Options", description="Further options as on the command line, such as --together 4 --fov 20"
+    )
+
+
+def command_args(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
+    """The arguments of the command `capture` (`capture.command`); a file of cameras, where needed, goes to `folder`.
+
+    Raises ValueError where something is missing or a path is impossible.
+    """
+    people, out = setting_path(asked.people, "People"), setting_path(asked.out, "Captures")
+    if not people or not out:
+        raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
+    args = ["--people", people, "--out", out, "--poses", str(asked.pose_count)]
+    args += ["--size", str(asked.width), str(asked.height)]
+    for name in ("seed", "samples", "light"):
+        args += [f"--{name}", str(getattr(asked, name))]
+    hdri = asked.hdri if asked.light == "hdri" else ""
+    for name, label, path in (
+        ("body", "Body", asked.body),
+        ("pose-files", "Poses", asked.poses),
+        ("hdri", "HDRI", hdri),
+    ):
+        args += [f"--{name}", setting_path(path, label)] if path else []
+    args += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
+    if asked.arrangement == "custom":
+        args += _camera_args(asked, context, folder)
+    else:
+        args += ["--arrangement", asked.arrangement, "--cameras", str(asked.camera_count)]
+    return args + shlex.split(asked.options)
+
+
+def _camera_args(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
+    depsgraph, render = context.evaluated_depsgraph_get(), context.scene.render
+    aspect = (render.pixel_aspect_x, render.pixel_aspect_y)
+    objects = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects
+    cameras = sorted((obj for obj in objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
+    if not cameras:
+        raise ValueError("no camera takes pictures: choose a collection with cameras, or select some")
+    views = [view_of(camera, depsgraph, (asked.width, asked.height), aspect) for camera in cameras]
+    named = {
+        f"camera{i:04d}": {"K": v.intrinsics.tolist(), "R": v.rotation.tolist(), "T": v.translation.tolist()}
+        for i, v in enumerate(views)
+    }
+    path = folder / "cameras.json"
+    path.write_text(json.dumps(named), encoding="utf-8")
+    return ["--camera-file", str(path)]
+
+
+PROPERTIES = ((bpy.types.Scene, "primdiffusion_captures", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_captures)),)
+
+
+captures = Session("captures are being rendered", "Cancelled; the same settings resume from here")
+"""One for all windows."""
+
+
+def capturing(words: Sequence[str], folder: Path) -> Steps:
+    """Steps of the command `capture`, whose temporary files go to `folder`, which is removed.
+
+    Closing it kills the Blender that renders: its views are written whole or not at all.
+    """
+    output, errors, process = Output(), Output(), None
+    step, said = Step("Starting Blender", 0.0), []
+    try:
+        process = subprocess.Popen(
+            [*child_command(), *words, "--progress", "json", "--while-stdin"],
+            stdin=subprocess.PIPE,
+            stdout=output.target,
+            stderr=errors.target,
+            env={**passed_on(COMPUTING, BLENDER), "TMPDIR": str(folder), "TEMP": str(folder), "TMP": str(folder)},
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+        exit_code = None
+        while exit_code is None or not output.at_end:
+            exit_code = process.poll()  # before reading: then all that it wrote is there
+            for line in output.lines():
+                if line.startswith(MARK.encode()):  # others are Blender's
+                    step = _step(line.decode("utf-8", "replace")[len(MARK) :], step)
+                    said = [*said, *step.lines][-2:]
+                    yield step
+            yield Step(step.message, step.fraction)
+        if exit_code == DONE:
+            return said[-1]
+        complaints = [line.removeprefix("capture: ") for line in errors.log() if line.startswith("capture: ")]
+        raise RuntimeError("; ".join(complaints[-1:] or said) or f"Blender ended with code {exit_code}")
+    finally:
+        if process is not None:
+            process.kill()
+            process.wait()
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+        output.close()
+        errors.close()
+        remove_folder(folder, folder.parent)
+
+
+def _step(message: str, before: Step) -> Step:
+    """What a message of the child says. Raises RuntimeError for a malformed one."""
+    try:
+        progress = read(CapturesProgress, parse_message(message))
+    except ValueError as fault:
+        raise RuntimeError(f"Blender was ended because it sent a malformed message ({fault}): render again") from fault
+    if progress.line is not None:
+        return Step(before.message, before.fraction, (progress.line,))
+    left = f" ({duration(progress.eta_s)} left)" if progress.eta_s else ""
+    text = f"{progress.subject}: view {progress.done} of {progress.total}{left}"
+    return Step(text, progress.done / max(progress.total, 1), tuple(progress.news))
+
+
+def child_command() -> list[str]:
+    """The command that starts a Blender for captures, without its options."""
+    script = str(Path(__file__).resolve().parents[1] / "capture" / "__main__.py")
+    if bpy.app.binary_path:
+        return [bpy.app.binary_path, "-b", "--factory-startup", "--python", script, "--"]
+    return [sys.executable, script, "--"]
 
 
 class PRIMDIFFUSION_OT_render_captures(Reporting, bpy.types.Operator):
@@ -36,116 +210,32 @@ class PRIMDIFFUSION_OT_render_captures(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.render_captures"
     bl_label = "Render Captures"
 
-    options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
-
     def act(self, context: bpy.types.Context) -> set[str]:
         """Another Blender renders; a timer follows it, or in background mode this waits."""
-        settings = context.scene.primdiffusion_captures
-        folder = _temporary_folder()
-        args = command_args(settings, context, folder) + shlex.split(self.options)
+        folder = Path(tempfile.mkdtemp(prefix="primdiffusion_captures_", dir=bpy.app.tempdir or None))
+        args = command_args(context.scene.primdiffusion_captures, context, folder)
         settings_of(parse(args))  # report impossible settings at once
         captures.start(capturing(args, folder))
         return captures.follow(self)
 
 
-class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
-    """Read every file of the captures and report what is missing, truncated or altered"""
-
-    bl_idname = "primdiffusion.verify_captures"
-    bl_label = "Verify"
-
-    repair: bpy.props.BoolProperty(
-        name="Repair", description="Remove damaged files, so that the next run renders only those again"
-    )
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        out = setting_path(context.scene.primdiffusion_captures.out, "Captures")
-        if not out:
-            raise ValueError("choose the folder of captures first")
-        args = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
-        captures.start(capturing(args, _temporary_folder()))
-        return captures.follow(self)
-
-
-class PRIMDIFFUSION_OT_preview_rig(Reporting, bpy.types.Operator):
-    """Show the cameras around the active object, or hide them again"""
-
-    bl_idname = "primdiffusion.preview_rig"
-    bl_label = "Preview Cameras"
-    bl_options = {"UNDO"}
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        collection = context.scene.collection.children.get(RIG)
-        if collection is not None:
-            remove_rig(collection)
-            return {"FINISHED"}
-        rig = context.scene.primdiffusion_captures.rig()
-        collection = bpy.data.collections.new(RIG)
-        context.scene.collection.children.link(collection)
-        for number, view in enumerate(rig.views(*_sphere_around(context))):
-            camera = bpy.data.objects.new(f"Capture {number:04d}", bpy.data.cameras.new(f"Capture {number:04d}"))
-            collection.objects.link(camera)
-            aim(camera, view)
-            camera.data.display_size = 0.1
-            camera.hide_select = True
-        return {"FINISHED"}
-
-
-def remove_rig(collection: bpy.types.Object) -> None:
-    """Remove the preview, but no objects that the user has added to its collection."""
-    ours = [obj for obj in collection.objects if obj.type == "CAMERA" and obj.name.startswith("Capture ")]
-    cameras = [obj.data for obj in ours]
-    bpy.data.batch_remove([*ours, *cameras, collection])
-
-
-def _temporary_folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="primdiffusion_captures_", dir=bpy.app.tempdir or None))
-
-
-def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
-    """Bounding sphere of the active object and its children, else of a human at the origin."""
-    active = context.active_object
-    objects = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
-    depsgraph = context.evaluated_depsgraph_get()
-    corners = [
-        obj.matrix_world @ corner
-        for obj in (obj.evaluated_get(depsgraph) for obj in objects)
-        for corner in map(Vector, obj.bound_box)
-        if obj.type in ("MESH", "ARMATURE")
-    ]
-    if not corners:
-        return np.zeros(3), _PERSON_M
-    centre, radius = bounding_sphere(points_to_backend(np.array(corners)))
-    return (centre, radius) if radius > 0 else (centre, _PERSON_M)
-
-
 _SHOWN_LINES = 4
-_OUTPUT = ("width", "height", "background", "passes", "float_depth", "released_reference")
 
 
-class DataPanel(SidebarPanel):
-    """A panel in the tab of captures, which the preferences show."""
+class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
+    """From where to where, the button, how far it is, and all settings; shown if the preferences ask for it."""
 
-    bl_category = DATA
+    bl_label = "Captures"
+    bl_order = 10
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "captures"
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         return shows_captures()
 
-
-class PRIMDIFFUSION_PT_captures(DataPanel, bpy.types.Panel):
-    """From where to where, the button, how far it is, and all settings."""
-
-    bl_label = "Captures"
-    bl_order = 10
-    manual_page = "captures"
-
     def draw(self, context: bpy.types.Context) -> None:
         layout, asked = property_columns(self.layout), context.scene.primdiffusion_captures
-        column = layout.column()
-        column.enabled = not captures.busy
-        column.prop(asked, "people")
-        column.prop(asked, "out")
         if captures.busy:
             layout.progress(factor=captures.fraction, text=captures.message, translate=False)
             layout.operator("primdiffusion.cancel", icon="CANCEL").what = "CAPTURES"
@@ -156,57 +246,14 @@ class PRIMDIFFUSION_PT_captures(DataPanel, bpy.types.Panel):
         if captures.busy or captures.error:
             for text in list(captures.lines)[-_SHOWN_LINES:]:
                 draw_lines(layout, text, "DOT")
-        _draw_settings(layout, asked, context)
-
-
-def _draw_settings(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
-    """Sections of settings, which cannot be changed while captures are rendered."""
-    sections = (
-        ("Input", ("body", "seed", "shard", "shards"), None),
-        ("Poses", ("poses", "pose_count", "together"), None),
-        ("Cameras", _cameras(asked), _draw_preview),
-        ("Cycles", _cycles(asked), None),
-        ("Output", _OUTPUT, _draw_verify),
-    )
-    for text, names, more in sections:
-        body = draw_section(layout, f"captures_{text.lower()}", text=text)
-        if body is None:
-            continue
-        if captures.busy:
-            draw_lines(body, "Wait for the captures, or cancel them", "INFO")
-        column = property_columns(body.column())
-        column.enabled = not captures.busy
-        for name in names:
+        column = layout.column()
+        column.enabled = not captures.busy  # they would have no effect
+        for name in (
+            "people", "out", "body", "seed", "poses", "pose_count", "arrangement",
+            "cameras" if asked.arrangement == "custom" else "camera_count", "width", "height", "passes", "samples",
+            "light", *(["hdri"] if asked.light == "hdri" else []), "options",
+        ):  # fmt: skip
             column.column().prop(asked, name)  # flags are one below the other
-        if more is not None:
-            more(column, asked, context)
-
-
-def _cameras(asked) -> tuple[str, ...]:
-    if asked.arrangement == "custom":
-        return "arrangement", "cameras"
-    rings = ("rings", "lowest", "highest") if asked.arrangement == "rings" else ()
-    return ("arrangement", "camera_count", *rings, "fov", "margin")
-
-
-def _cycles(asked) -> tuple[str, ...]:
-    hdri = ("hdri",) if asked.light == "hdri" else ()
-    shaded = () if asked.light == "uniform" else ("denoise", "shadows") if asked.together > 1 else ("denoise",)
-    return ("samples", "device", "light", *hdri, *shaded)
-
-
-def _draw_preview(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
-    if asked.arrangement != "custom":
-        text = "Hide Cameras" if RIG in context.scene.collection.children else "Preview Cameras"
-        layout.operator("primdiffusion.preview_rig", text=text, icon="CAMERA_DATA")
-    elif asked.cameras is None:
-        layout.label(text="Without a collection: the selected cameras", icon="INFO")
-
-
-def _draw_verify(layout: bpy.types.UILayout, _asked, _context) -> None:
-    row = layout.row(align=True)
-    row.operator("primdiffusion.verify_captures", icon="CHECKMARK").repair = False
-    row.operator("primdiffusion.verify_captures", text="Repair", icon="TOOL_SETTINGS").repair = True
 
 
 COMMAND = "primdiffusion"

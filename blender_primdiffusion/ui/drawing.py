@@ -1,32 +1,32 @@
-"""How jobs look in panels: button, progress, queue, errors and their remedies."""
+"""What panels have in common: how jobs look (button, progress, queue, errors), and buttons for the manual."""
 
 from __future__ import annotations
 
-import re
+import functools
 import textwrap
+from pathlib import Path
 
 import bpy
 
 from ..files.regular_files import printable
+from ..jobs.error_log import error_log
 from ..jobs.follow import blocking_activity
 from ..jobs.queue import JobOutcome, queue
-from ..jobs.remedies import error_log, remedy_for
 from ..jobs.windows import icons
-from ..places import backend_is_named
-from .manual import draw_manual_button
+from ..places import EXTENSION, backend_is_named
 
-MAIN, DATA = "PrimDiffusion", "PrimDiffusion Data"
-"""Tabs of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
+MAIN = "PrimDiffusion"
+"""Tab of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
 _LINE = 34
 """Characters that fit a sidebar of default width, beside an icon."""
-_QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
-_NO_BREAK = "\N{NO-BREAK SPACE}"
 _PICTURE_SCALE = 8.0
 _MINUTES_FROM_S = 90.0
+_MANUALS = (("manual", ".html"), ("../docs/manual", ".md"))
+"""Where pages may be, from the extension's folder: in an installed zip, in a checkout."""
 
 
 class SidebarPanel:
-    """A panel in the sidebar. Blender orders tabs as it orders their first panels."""
+    """A panel in the sidebar."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -105,14 +105,8 @@ def draw_job_state(layout: bpy.types.UILayout, kind: str) -> None:
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str, width: int = _LINE) -> None:
     """A sentence on as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(_wrapped(text, width)):
+    for number, line in enumerate(textwrap.wrap(printable(text), width)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
-
-
-def _wrapped(text: str, width: int = _LINE) -> list[str]:
-    """Lines that fit; numbers keep their units."""
-    together = _QUANTITY.sub(lambda match: match[0].replace(" ", _NO_BREAK), printable(text))
-    return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, width)]
 
 
 def _draw_progress(layout: bpy.types.UILayout) -> None:
@@ -134,27 +128,15 @@ def draw_queue(layout: bpy.types.UILayout) -> None:
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
 
 
-def draw_ended(layout: bpy.types.UILayout) -> None:
-    """The last jobs that ended, and how; messages are shown below their buttons."""
-    if not queue.ended:
-        return
-    column = layout.column(align=True)
-    for outcome in queue.ended:
-        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.succeeded else "CANCEL"
-        column.label(text=outcome.entry.job.label, icon=icon, translate=False)
-
-
 def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
-    """The message, or the error with its remedy."""
+    """The message, or the error with its log."""
     if outcome.error is None:
         draw_lines(layout, outcome.notice, "INFO")
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # side by side the labels would be cut
-    if (remedy := remedy_for(outcome.error)) is not None:
-        props = column.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
-        for name, value in remedy.properties.items():
-            setattr(props, name, value)
+    if outcome.error.kind == "environment":
+        column.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     column.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(error_log())
 
 
@@ -167,3 +149,26 @@ def _progress_text() -> str:
         return job.message
     left = f"{job.eta_s:.0f} s" if job.eta_s < _MINUTES_FROM_S else f"{job.eta_s / 60:.0f} min"
     return f"{job.message} ({left} left)"
+
+
+def draw_manual_button(layout: bpy.types.UILayout, page: str, anchor: str = "") -> None:
+    """A question mark that opens a page, for the headers of panels; nothing where the manual is not there."""
+    if url := page_url(page, anchor):
+        layout.operator("wm.url_open", text="", icon="QUESTION", emboss=False).url = url
+
+
+@functools.cache
+def page_url(page: str, anchor: str = "") -> str:
+    """Address of a page, or of a heading on it; empty where there is none."""
+    path = page_file(page) or page_file("index")
+    return "" if path is None else path.as_uri() + (f"#{anchor}" if anchor else "")
+
+
+def page_file(page: str) -> Path | None:
+    """The file of a page; None where there is none."""
+    extension = Path(__file__).resolve().parents[1]
+    for folder, ending in _MANUALS:
+        path = (extension / folder / f"{page}{ending}").resolve()
+        if path.is_file() and path.stem == page:
+            return path
+    return None

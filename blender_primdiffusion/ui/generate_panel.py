@@ -1,52 +1,21 @@
-"""The sidebar panel Generate: settings, presets, Generate Human."""
+"""The sidebar panel Generate: settings, Generate Human."""
 
 from __future__ import annotations
 
 import bpy
-from bl_operators.presets import AddPresetBase
-from bl_ui.utils import PresetPanel
 
 from ..backend.requests import sentence
-from ..jobs.follow import Reporting, device_line, submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.generate import GenerateJob
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .drawing import BackendPanel, draw_job, draw_lines, draw_section, property_columns
-from .export_panel import draw_as_mesh, draw_from_file
-from .generate_settings import CATEGORIES, SCALARS, draw_attributes, last_seed, random_seed, sampling, seed_property
-from .manual import draw_manual_button
+from .export_panel import draw_from_file
+from .generate_settings import draw_attributes, last_seed, random_seed, sampling, seed_property
 from .menus import draw_samples
 from .preferences import draw_set_up
 from .render_panel import draw_next_step
 from .variations_panel import draw_variations
-
-SUBDIR = "primdiffusion/generate"
-_ASKED = (*CATEGORIES, *(part for name in SCALARS for part in (f"use_{name}", name)))
-
-
-class PRIMDIFFUSION_PT_generate_presets(PresetPanel, bpy.types.Panel):
-    """Choose, add and remove presets"""
-
-    bl_label = "Generate Presets"
-    preset_subdir = SUBDIR
-    preset_operator = "script.execute_preset"
-    preset_add_operator = "primdiffusion.add_generate_preset"
-
-
-class PRIMDIFFUSION_OT_add_generate_preset(AddPresetBase, bpy.types.Operator):
-    """Keep quality, sampler, steps, attributes and guidance as a preset, or remove one"""
-
-    bl_idname = "primdiffusion.add_generate_preset"
-    bl_label = "Add Generate Preset"
-    preset_menu = "PRIMDIFFUSION_PT_generate_presets"
-    preset_subdir = SUBDIR
-    preset_defines = ["settings = bpy.context.scene.primdiffusion"]
-    preset_values = [
-        "settings.steps",
-        "settings.sampler",
-        "settings.guidance",
-        *(f"settings.attributes.{name}" for name in _ASKED),
-    ]
 
 
 class PRIMDIFFUSION_OT_generate(Reporting, bpy.types.Operator):
@@ -84,10 +53,7 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
 
     bl_label = "Generate"
     bl_order = 0
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        PRIMDIFFUSION_PT_generate_presets.draw_panel_header(self.layout)
-        draw_manual_button(self.layout, "first_human")
+    manual_page = "first_human"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion
@@ -107,11 +73,9 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
             column.prop(settings, "sampler")
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE", reason)
         if queue.child_message:
-            draw_lines(layout, sentence(device_line()), "ERROR")
+            draw_lines(layout, sentence(f"{queue.child_message}; restarts with the next human"), "ERROR")
         if humans(context.scene) and not queue.busy:
             draw_next_step(layout, context.scene)
-        if ready:
-            draw_as_mesh(layout, context)
         page, section = "first_human", "variations"
         if (body := draw_section(layout, "attributes", text="Attributes", page=page, section="attributes")) is not None:
             draw_attributes(body, settings.attributes)

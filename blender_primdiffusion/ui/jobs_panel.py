@@ -1,4 +1,4 @@
-"""The sidebar panel Jobs, shown while there are any; the backend: its device and its memory."""
+"""The sidebar panel Jobs, shown while there are any."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..jobs import follow
-from ..jobs.follow import Reporting, device_line, redraw
+from ..jobs.follow import Reporting, redraw
 from ..jobs.queue import queue
-from .captures_settings import captures
+from .captures_panel import captures
 from .declared import SKIP
-from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
+from .drawing import SidebarPanel, draw_queue
 from .preferences import cancel_set_up
 
 
@@ -28,11 +28,6 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
             ("JOB", "Job", "Stop this job, or remove it from the queue; nothing is added to the scene"),
             ("CAPTURES", "Captures", "Stop rendering; finished pictures stay, and the next run resumes from them"),
             ("SET_UP", "Set-Up", "Stop; the next Set Up Backend uses what was downloaded"),
-            (
-                "MEMORY",
-                "Memory",
-                "End the processes that generate and draw, to release their memory; they restart when needed",
-            ),
         ],
         options=SKIP,
     )
@@ -47,8 +42,6 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
             captures.cancel()
         elif self.what == "SET_UP":
             cancel_set_up()
-        elif self.what == "MEMORY":
-            follow.release()
         elif not queue.cancel(self.number):
             which = f"job {self.number} is no longer queued" if self.number else "no job is running yet"
             raise ValueError(which)
@@ -57,7 +50,7 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
-    """Queued jobs, and those that ended before. Progress is shown below the button that started the job."""
+    """Queued jobs. Progress is shown below the button that started the job."""
 
     bl_label = "Jobs"
     bl_order = 5
@@ -68,13 +61,6 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
 
     def draw(self, _context: bpy.types.Context) -> None:
         draw_queue(self.layout)
-        draw_ended(self.layout)
-
-
-def draw_backend(layout: bpy.types.UILayout) -> None:
-    """What computes, and what to do when it does not."""
-    draw_lines(layout, f"Device: {device_line()}", "MEMORY")
-    layout.operator("primdiffusion.cancel", text="Release Memory", icon="TRASH").what = "MEMORY"
 
 
 @persistent

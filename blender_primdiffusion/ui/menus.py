@@ -1,4 +1,4 @@
-"""Blender's own menus, and with them its search (F3): Add > Human, File > Import and Export."""
+"""Blender's own menus, and with them its search (F3): Add > Human, File > Import and Export; Viewport Overlays."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 import bpy
 
 from ..places import EXTENSION, backend_is_named
+from ..scene.human import any_humans
 from .preferences import known
 
-_IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply, .vdb)"
+_IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply)"
 FOLDER = Path(__file__).resolve().parents[1] / "gallery"
 
 
@@ -53,7 +54,20 @@ def draw_export(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
     menu.layout.operator("primdiffusion.export", text=_EXPORT)
 
 
-_ENTRIES = (("VIEW3D_MT_add", draw_add), ("TOPBAR_MT_file_import", draw_import), ("TOPBAR_MT_file_export", draw_export))
+def draw_switch(menu: bpy.types.Panel, context: bpy.types.Context) -> None:
+    """In the popover Viewport Overlays: whether views show humans."""
+    if any_humans():
+        column = menu.layout.column()
+        column.label(text="PrimDiffusion", translate=False)
+        column.prop(context.scene.primdiffusion_render, "in_viewports")
+
+
+_ENTRIES = (
+    ("VIEW3D_MT_add", draw_add),
+    ("TOPBAR_MT_file_import", draw_import),
+    ("TOPBAR_MT_file_export", draw_export),
+    ("VIEW3D_PT_overlay", draw_switch),
+)
 
 
 def register() -> None:

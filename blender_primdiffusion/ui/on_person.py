@@ -105,15 +105,6 @@ class WhereTo:
             ("PLACE", "In Place", "The human stays in place; only the height of the path is used"),
         ],
     )
-    into: bpy.props.EnumProperty(
-        name="Into",
-        description="Where the keys go",
-        items=[
-            ("NEW", "New Action", "A new action; the previous one stays in the file"),
-            ("APPEND", "Append", "After the last key of the human's current action"),
-            ("STRIP", "NLA Strip", "A strip on a new track of the nonlinear animation"),
-        ],
-    )
     extend: bpy.props.BoolProperty(
         name="Extend Scene",
         description="Move the end of the scene to the end of the motion if it is later",

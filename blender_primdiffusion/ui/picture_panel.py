@@ -26,14 +26,6 @@ class PRIMDIFFUSION_PG_picture(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    mask_label: bpy.props.IntProperty(
-        name="Mask Label",
-        description="The person's label in a mask of more than two: the index in its palette, or else the grey value; "
-        "-1: the mask is white where the person is",
-        default=-1,
-        min=-1,
-        max=65535,
-    )
     seed: bpy.props.IntProperty(
         name="Seed",
         description="Random seed for parts not visible in the picture; -1 uses the most likely appearance",
@@ -100,7 +92,7 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         if self.only_fit and person is None:
             raise ValueError("select the human that is posed over the picture: there is none to fit")
         target = HumanTarget.of(person) if self.only_fit else None
-        task = PictureTask.of(context, mask, asked.mask_label, person)
+        task = PictureTask.of(context, mask, person)
         if target is not None:
             return submit(self, context, FitPictureJob(task, target))
         return submit(self, context, PictureJob(task, asked.seed, 0 if person is None else person.session_uid))
@@ -126,11 +118,8 @@ class PRIMDIFFUSION_PT_human_from_picture(BackendPanel, bpy.types.Panel):
         layout.operator("primdiffusion.choose_picture", icon="IMAGE_DATA")
         if image is not None:
             layout.label(text=image.name, icon="CAMERA_DATA", translate=False)
-        column = layout.column()
-        column.prop(asked, "mask")
-        if asked.mask:
-            column.prop(asked, "mask_label")
-        column.prop(asked, "seed")
+        layout.prop(asked, "mask")
+        layout.prop(asked, "seed")
         missing = "" if image is not None else "Choose a picture first."
         reason = missing or ("" if person is not None else "Select a human posed over the picture to fit it.")
         fit = draw_job(layout, "fit_picture", "primdiffusion.human_from_picture", "SNAP_ON", reason, text="Fit")
@@ -138,22 +127,6 @@ class PRIMDIFFUSION_PT_human_from_picture(BackendPanel, bpy.types.Panel):
         draw_job(
             layout, "from_picture", "primdiffusion.human_from_picture", "ARMATURE_DATA", missing, text="Make Human"
         )
-
-
-class PRIMDIFFUSION_FH_picture(bpy.types.FileHandler):
-    """Pictures, while the panel's tab is open: otherwise Blender places a dropped picture as it always does."""
-
-    bl_idname = "PRIMDIFFUSION_FH_picture"
-    bl_label = "Human from Picture"
-    bl_import_operator = "primdiffusion.choose_picture"
-    bl_file_extensions = ".png;.jpg;.jpeg"
-
-    @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
-        if context.area is None or context.area.type != "VIEW_3D" or not context.space_data.show_region_ui:
-            return False
-        tabs = (region.active_panel_category for region in context.area.regions if region.type == "UI")
-        return PRIMDIFFUSION_PT_human_from_picture.bl_category in tabs
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_picture", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_picture)),)

@@ -10,9 +10,8 @@ import bpy
 from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, own_python_has_backend, state_of
 from ..backend.requests import sentence
 from ..jobs.follow import redraw
-from ..jobs.queue import queue
 from ..places import EXTENSION, INSTALLS_BACKEND, installed_backend, preference, set_up_folder
-from .drawing import DATA, draw_lines
+from .drawing import draw_lines
 
 if INSTALLS_BACKEND:
     from . import setup
@@ -103,17 +102,7 @@ def cancel_set_up() -> None:
     redraw()
 
 
-def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    """What the former Python did is of no interest any more."""
-    if setup:
-        setup.session.error = setup.session.notice = ""
-    for kind, outcome in list(queue.outcomes.items()):
-        if outcome.error is not None and outcome.error.kind == "environment":
-            del queue.outcomes[kind]
-    redraw()
-
-
-def _captures_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+def _changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
     redraw()
 
 
@@ -130,30 +119,17 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="Python 3.11 or newer with PrimDiffusion's packages (torch), or the program primdiffusion; empty: "
         + ("the private environment" if setup else "the program on the PATH"),
         subtype="FILE_PATH",
-        update=_python_changed,
+        update=_changed,
     )
     checkpoint: bpy.props.StringProperty(
         name="Checkpoint",
         description="Diffusion model, a .safetensors file; empty: the bundled one",
         subtype="FILE_PATH",
     )
-    encoder: bpy.props.StringProperty(
-        name="Encoder",
-        description="Encoder for humans from captures, a .safetensors file; empty: the bundled one",
-        subtype="FILE_PATH",
-    )
-    idle_minutes: bpy.props.IntProperty(
-        name="Release Memory After (min)",
-        description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
-        "0: never",
-        default=10,
-        min=0,
-        soft_max=120,
-    )
     captures: bpy.props.BoolProperty(
         name="Captures",
-        description=f"Show the tab {DATA} in the sidebar: training data from scans, and humans from images",
-        update=_captures_changed,
+        description="Show the panel Captures in the sidebar: training data from scans",
+        update=_changed,
     )
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -161,7 +137,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         _draw_backend(self, layout.box())
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "captures"):
+        for name in ("backend_python", "checkpoint", "captures"):
             layout.prop(self, name)
 
 

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import bpy
-from mathutils import Euler, Vector
 
 from ..backend.environment import NOT_INSTALLED
 from ..engine.engine import ENGINE
-from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
 from ..jobs.volumes import MergeJob, PoseSnapshot
 from ..places import backend_is_named
-from ..scene.human import HumanTarget, human_of, humans
-from ..scene.place import frame_box, humans_extent, new_camera, posed_extent
-from ..scene.representation import in_viewport, representation_of
+from ..scene.human import HumanTarget, humans
+from ..scene.representation import representation_of
 from ..scene.volume_nodes import fit_cycles_to_volumes
-from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
+from .drawing import SidebarPanel, draw_job_state, property_columns
 from .preferences import draw_set_up, known
 
 _FROM_EEVEE = frozenset(
@@ -54,7 +50,6 @@ class PRIMDIFFUSION_PT_marching(_OfEngine, bpy.types.Panel):
         draw_set_up(layout)
         layout.prop(settings, "view")
         layout.prop(settings, "step")
-        layout.prop(settings, "solids")
         layout.prop(context.scene.render, "film_transparent", text="Transparent")
 
 
@@ -96,7 +91,6 @@ def unregister() -> None:
 
 
 _SAMPLES = 4
-_YAW = math.radians(20)
 
 
 _ENGINES = (
@@ -150,79 +144,35 @@ def _merge_all(operator: bpy.types.Operator, context: bpy.types.Context) -> set[
     return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
-    """Add a camera that frames the selected human, or all humans, and a sun for other objects"""
-
-    bl_idname = "primdiffusion.add_camera"
-    bl_label = "Add Camera and Light"
-    bl_options = {"UNDO"}
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        scene = context.scene
-        person = human_of(context.view_layer.objects.active)
-        context.view_layer.update()
-        extent = humans_extent(scene) if person is None else posed_extent(person)
-        camera = new_camera(scene)
-        camera.name = camera.data.name = "Human Camera"
-        frame_box(camera, extent, _YAW, (scene.render.resolution_x, scene.render.resolution_y))
-        scene.camera = camera
-        sun = bpy.data.objects.new("Human Sun", bpy.data.lights.new("Human Sun", "SUN"))
-        sun.data.energy = 3.0
-        sun.rotation_euler = Euler((math.radians(40), 0, math.radians(30)))
-        sun.location = camera.location + Vector((0, 0, 2))
-        scene.collection.objects.link(sun)
-        return {"FINISHED"}
-
-
 def _plain_colours(scene: bpy.types.Scene) -> None:
     """Other transforms change the colours that humans were made with."""
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
 
 
-EXACT = "Renders humans exactly, other objects with simple shading"
-APPROXIMATE = "Renders humans approximately, with light and shadows"
-UNLIT = "Renders humans approximately, with light and shadows; 3D views need Show Volumes in Viewport for that"
-OTHER_ENGINE = "Renders humans blurred: choose an engine above"
-
-
-def how_shown(scene: bpy.types.Scene) -> str:
-    """How the scene's engine shows humans, in renders and in Rendered views."""
-    engine = scene.render.engine
-    drawer = who_draws(engine, "RENDERED", all(in_viewport(person) for person in humans(scene)))
-    if drawer is Drawer.ENGINE:
-        return EXACT
-    if engine != "CYCLES":
-        return OTHER_ENGINE
-    return UNLIT if drawer is Drawer.OVERLAY else APPROXIMATE
-
-
 def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """The button that leads to a picture: an engine that shows humans as they are, a camera, the render."""
+    """The button that leads to a picture: an engine that shows humans as they are, the render."""
     engine = scene.render.engine
     if engine not in (ENGINE, "CYCLES") and not known().usable:
         props = layout.operator("primdiffusion.set_up_engine", text="Switch to Cycles", icon="SHADING_TEXTURE")
         props.engine = "CYCLES"
     elif engine not in (ENGINE, "CYCLES"):
         layout.operator("primdiffusion.set_up_engine", text="Switch to PrimDiffusion Engine", icon="SHADING_RENDERED")
-    elif scene.camera is None:
-        layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")
-    else:
+    elif scene.camera is not None:
         layout.operator("render.render", text="Render Image", icon="RENDER_STILL")
 
 
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """A choice of engines for humans, and how the current one shows them."""
-    engine, line = scene.render.engine, how_shown(scene)
+    """A choice of engines for humans."""
+    engine = scene.render.engine
     row = layout.row(align=True)
     for (name, label, _), icon in zip(_ENGINES, ("SHADING_RENDERED", "SHADING_TEXTURE"), strict=True):
         if name != ENGINE or known().usable:
             row.operator("primdiffusion.set_up_engine", text=label, depress=engine == name, icon=icon).engine = name
-    draw_lines(layout, line, "INFO")
 
 
 class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):
-    """Which engine, and a camera."""
+    """Which engine."""
 
     bl_label = "Render"
     bl_order = 2
@@ -234,4 +184,3 @@ class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):
         if context.scene.render.engine == ENGINE:
             draw_set_up(self.layout)
         draw_job_state(self.layout, "merge")
-        self.layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")

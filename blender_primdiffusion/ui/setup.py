@@ -6,7 +6,6 @@ The viewer build lacks this file.
 from __future__ import annotations
 
 import functools
-import os
 from pathlib import Path
 
 import bpy
@@ -23,9 +22,7 @@ from .declared import SKIP
 from .drawing import draw_lines
 
 LOCKS = Path(__file__).resolve().parents[1] / "requirements"
-OWN_LOCK = "requirements.txt"
-"""In a folder of wheels: a list of packages that goes before ours."""
-_ONLINE = "Blender may not use the network: allow it, or install from a folder"
+_ONLINE = "Blender may not use the network: allow it, or name an existing Python in the preferences"
 
 
 session = Session(
@@ -69,20 +66,16 @@ def is_outdated(about: dict) -> bool:
     return path.is_file() and read_once(path).digest != about.get("lock")
 
 
-def installing(wheels: Path | None = None) -> Steps:
-    """Steps of a set-up from the package index, or from a folder of wheels, whose own lock takes precedence.
-
-    Raises ValueError where there are no packages for this machine or Blender may not use the network, and OSError.
-    """
+def installing() -> Steps:
+    """Steps of a set-up. Raises ValueError where there are no packages for this machine or Blender may not use the
+    network, and OSError."""
     compute, lock, _ = chosen()
-    if wheels is None and not bpy.app.online_access:
+    if not bpy.app.online_access:
         raise ValueError(setup.OFFLINE)
-    if wheels is not None and (wheels / OWN_LOCK).is_file():
-        lock = read_lock(wheels / OWN_LOCK)  # the user may have changed it since
     module_path = backend_module_path()
     if module_path is None:
         raise ValueError("the extension lacks its backend: install its zip again")
-    return setup.set_up(set_up_folder(), lock, compute, module_path, cache_folder(), wheels)
+    return setup.set_up(set_up_folder(), lock, compute, module_path, cache_folder())
 
 
 def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
@@ -120,17 +113,13 @@ def draw_button(layout: bpy.types.UILayout, width: int, *, broken: bool) -> bool
 
 
 def draw_private(layout: bpy.types.UILayout, width: int, *, there: bool) -> None:
-    """For the preferences: what was found, the cost and all buttons; `there`: an environment to repair."""
-    draw_lines(layout, f"Found: {machine().described}", "SYSTEM", width)
+    """For the preferences: the cost and all buttons; `there`: an environment to repair."""
     possible = draw_cost(layout, width)
     row = layout.row()
-    row.enabled = possible
-    online = row.row()
-    online.enabled = bpy.app.online_access
-    online.operator("primdiffusion.set_up_backend", icon="IMPORT")
+    row.enabled = possible and bpy.app.online_access
+    row.operator("primdiffusion.set_up_backend", icon="IMPORT")
     if there:
-        online.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
-    row.operator("primdiffusion.set_up_backend", text="Install from Folder", icon="FILE_FOLDER").choose = True
+        row.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
 
 
 def draw_result(layout: bpy.types.UILayout, width: int) -> None:
@@ -156,39 +145,18 @@ class PRIMDIFFUSION_OT_set_up_backend(Reporting, bpy.types.Operator):
 
     bl_idname = "primdiffusion.set_up_backend"
     bl_label = "Set Up Backend"
-    described_by = ("choose", "repair")
+    described_by = ("repair",)
 
     repair: bpy.props.BoolProperty(name="Repair", description="Reinstall the backend", options=SKIP)
-    choose: bpy.props.BoolProperty(
-        name="Install from Folder",
-        description="Set up the backend from a folder of wheels, without a network; every file is checked against its "
-        "known hash",
-        options=SKIP,
-    )
-    directory: bpy.props.StringProperty(
-        name="Folder", description="Folder of wheels; empty: they are downloaded", subtype="DIR_PATH", options=SKIP
-    )
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        if not self.choose:
-            return self.execute(context)
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     def act(self, _context: bpy.types.Context) -> set[str]:
         if session.busy:
             raise ValueError("the backend is being set up already; wait for it, or press Cancel")
-        wheels = None
-        if self.choose or self.directory:
-            wheels = Path(bpy.path.abspath(self.directory))
-            if not os.path.isdir(wheels):
-                raise ValueError(f"{self.directory!r:.200} is not a folder: choose the one that holds the wheels")
         state, about = state_of(set_up_folder())
-        if wheels is None and not self.repair and state == "ready" and about.get("compute") == chosen()[0]:
+        if not self.repair and state == "ready" and about.get("compute") == chosen()[0]:
             self.report({"INFO"}, "the backend is set up already; press Repair to reinstall it")
             return {"FINISHED"}
-        steps = installing(wheels)
+        steps = installing()
         if queue.busy:
             raise ValueError("the backend is at work; wait until it is done, or press Cancel")
         queue.close()  # children that run on the environment: their files could not be replaced

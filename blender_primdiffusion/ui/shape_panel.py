@@ -1,4 +1,4 @@
-"""The section Shape of the panel Human; the human's shape and loop are properties of the armature, applied at once."""
+"""The section Shape of the panel Human; the human's shape is a property of the armature, applied at once."""
 
 from __future__ import annotations
 
@@ -7,30 +7,25 @@ from collections.abc import Sequence
 
 import bpy
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..files.regular_files import printable
-from ..scene.actions import action_curves, end_repeat, loops, repeat
+from ..scene.actions import action_curves
 from ..scene.edit import check_shapeable, reshape
-from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human, selected_person
+from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, is_human, selected_person
 from ..scene.human_file import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
 from .drawing import draw_lines, draw_section, property_columns
-from .on_person import HumanOperator, other_human
+from .on_person import HumanOperator
 
 _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
 _FARTHEST = 3.0
 _SHAPES = (
-    ("GIVEN", "Parameters", "Shape parameters, or a height and a weight"),
     ("RANDOM", "Random", "Give the selected human a random body shape; the same seed gives the same shape"),
     ("GENERATED", "As Generated", "Reset the selected human to the shape of the last edit, or of generation"),
-    ("OTHER", "Other Human", "Copy the body shape of the other human to the selected human"),
 )
-_SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ()}
-"""Properties of the operator that matter, by shape."""
 
 
 def person_of(armature: bpy.types.Object) -> bpy.types.Object:
@@ -96,17 +91,6 @@ def _log_errors(change) -> None:
         print(printable(f"PrimDiffusion: {error}"))
 
 
-def _looped(self: PRIMDIFFUSION_PG_human) -> bool:
-    return action_curves(self.id_data) is not None and loops(self.id_data)
-
-
-def _loop(self: PRIMDIFFUSION_PG_human, looped: bool) -> None:
-    if action_curves(self.id_data) is None:
-        print(f"PrimDiffusion: {self.id_data.name!r} has no action to loop: import or add a motion first")
-    elif looped != loops(self.id_data):
-        (repeat if looped else end_repeat)(self.id_data)
-
-
 class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
@@ -150,17 +134,10 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
         get=_weight,
         set=_set_weight,
     )
-    loop: bpy.props.BoolProperty(
-        name="Loop",
-        description="Loop the motion; a walk continues from where it has arrived",
-        options=_NOT_ANIMATED,
-        get=_looped,
-        set=_loop,
-    )
 
 
 class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
-    """Set the body shape of the selected human: by numbers, at random, as generated, or as another human's"""
+    """Set the body shape of the selected human: at random, or as generated"""
 
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
@@ -168,14 +145,6 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
     described_by = ("to",)
 
     to: bpy.props.EnumProperty(name="Reshape To", description="Which shape", items=_SHAPES, options=SKIP)
-    betas: bpy.props.FloatVectorProperty(
-        name="Shape",
-        size=BETA_COUNT,
-        description="Shape parameters in standard deviations. Not given: unchanged",
-        options=SKIP,
-    )
-    height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options=SKIP)
-    weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options=SKIP)
     seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another body", min=0, options=SKIP)
     spread: bpy.props.FloatProperty(
         name="Spread",
@@ -192,35 +161,16 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
-        for name in ("to", *_SETTINGS[self.to]):
+        for name in ("to", "seed", "spread") if self.to == "RANDOM" else ("to",):
             layout.prop(self, name)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        warning = reshape(person, self._betas(context, person))
+    def run(self, _context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
+        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
+        random_betas = np.clip(drawn, -_FARTHEST, _FARTHEST)
+        warning = reshape(person, random_betas if self.to == "RANDOM" else generated_betas(person))
         if warning:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
-
-    def _betas(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
-        """The new shape [10]. Raises ValueError."""
-        if self.to == "GENERATED":
-            return generated_betas(person)
-        if self.to == "OTHER":
-            return self._betas_of_other(context, person)
-        if self.to == "RANDOM":
-            drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
-            return np.clip(drawn, -_FARTHEST, _FARTHEST)
-        betas = np.array(self.betas) if self.given("betas") else betas_of(person)
-        height, weight = (getattr(self, name) if self.given(name) else None for name in ("height", "weight"))
-        return betas_of_measures(shape_model_of(person), betas, height, weight)
-
-    def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
-        other = other_human(context, person)
-        if len(shape_model_of(other).template) != len(shape_model_of(person).template):
-            raise ValueError(
-                f"{other.name!r} stands on another body than {person.name!r}: their shape parameters are not comparable"
-            )
-        return betas_of(other)
 
 
 _ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
@@ -238,18 +188,10 @@ def draw_shape(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings = person.primdiffusion_human
     layout.prop(settings, "height")
     layout.prop(settings, "weight")
-    shown = in_the_scene(context.scene, person, settings.height)
-    if shown:
-        layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
     _draw_sliders(layout, settings, {index: name for index, name in enumerate(names) if not name.isdecimal()})
     row = layout.row(align=True)
     row.operator("primdiffusion.reshape", text="Random", icon="FILE_REFRESH").to = "RANDOM"
     row.operator("primdiffusion.reshape", text="Reset", icon="LOOP_BACK").to = "GENERATED"
-    if len(humans(context.scene)) > 1:
-        row = layout.row(align=True)
-        row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
-        if context.scene.primdiffusion_edit.other is not None:
-            row.operator("primdiffusion.reshape", text="", icon="PASTEDOWN").to = "OTHER"
     if _animated(person):
         draw_lines(layout, _ANIMATED, "INFO")
     if (body := draw_section(layout, "more_sliders", text="More Sliders")) is not None:
@@ -261,17 +203,6 @@ def _draw_sliders(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup,
     column = layout.column(align=True) if names else layout  # an empty column leaves a gap
     for index, name in names.items():
         column.prop(settings, "betas", index=index, text=name, slider=True)
-
-
-def in_the_scene(scene: bpy.types.Scene, armature: bpy.types.Object, height: float) -> str:
-    """The height in the scene's units, with the armature's scale; empty where that is the same in metres."""
-    units, scale = scene.unit_settings, armature.matrix_world.to_scale().z
-    metric = units.system == "METRIC" and units.length_unit in ("METERS", "ADAPTIVE")
-    if metric and abs(units.scale_length * scale - 1) < 1e-4:
-        return ""
-    if units.system == "NONE":
-        return f"{height * scale:.3f} units"
-    return bpy.utils.units.to_string(units.system, "LENGTH", height * scale * units.scale_length, precision=3)
 
 
 def _animated(armature: bpy.types.Object) -> bool:

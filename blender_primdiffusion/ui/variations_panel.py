@@ -11,7 +11,7 @@ from bpy.app.handlers import persistent
 
 from ..backend.requests import sentence
 from ..formats.requests import VariationsRequest
-from ..jobs.follow import Reporting, redraw, submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
 from ..jobs.windows import icons
@@ -19,7 +19,7 @@ from ..scene.build import build_human
 from ..scene.place import stand_at_cursor
 from .declared import SKIP, declared
 from .drawing import draw_job, row_unless
-from .generate_settings import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, sampling, seed_property
+from .generate_settings import LARGEST_SEED, last_seed, sampling, seed_property
 
 MOST = 16
 COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in range(4, MOST + 1, 4)]
@@ -30,28 +30,6 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
 
     count: bpy.props.EnumProperty(
         name="Count", description="How many humans to choose from", items=COUNT_ITEMS, default="8"
-    )
-    seeds: bpy.props.EnumProperty(
-        name="Seeds",
-        description="Seeds of the humans",
-        items=[
-            ("CONSECUTIVE", "Consecutive Seeds", "The seed of the panel Generate and the following ones"),
-            ("RANDOM", "Random", "New random seeds each time"),
-        ],
-        default="RANDOM",
-    )
-    quality: bpy.props.EnumProperty(
-        name="Quality",
-        description="Humans are built exactly as shown here, in this quality",
-        items=[
-            ("PANEL", "As Generate", "Steps and sampler of the panel Generate: no refining needed"),
-            (
-                "DRAFT",
-                "Draft",
-                "8 steps of DPM-Solver++: quicker and softer. Generating the seed again with more steps refines the "
-                "human, but sometimes gives another one",
-            ),
-        ],
     )
     amount: declared(VariationsRequest, "amount", name="Difference", min=0.05)
 
@@ -66,51 +44,28 @@ def _select(_manager: bpy.types.WindowManager, selected: Sequence[bool]) -> None
         variation.chosen = chosen
 
 
-_USE_SEED = "Set the seed of the panel Generate to that of the selected human and lock it"
-
-
 class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
-    """Show several humans to choose from before building them"""
+    """Show several new humans to choose from before building them, in the quality of the panel Generate"""
 
     bl_idname = "primdiffusion.variations"
     bl_label = "Show Variations"
-    described_by = ("clear", "like", "use_seed")
+    described_by = ("like",)
 
     seed: seed_property()
     like: bpy.props.BoolProperty(
         name="More Like This", description="Variations of a human of the sheet, with the same body", options=SKIP
     )
-    use_seed: bpy.props.BoolProperty(name="Use Seed", description=_USE_SEED, options=SKIP)
-    clear: bpy.props.BoolProperty(
-        name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
-    )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        """A seed given by a script is the first of `count`."""
-        if self.clear:
-            clear_before_loading()
-            redraw()
-            return {"FINISHED"}
-        if self.use_seed:
-            return self._use_seed(context.scene.primdiffusion)
+        """A seed given by a script is the first of `count`; otherwise they are random."""
         settings, like = context.scene.primdiffusion_variations, {}
         if self.like:
-            around = _only(_targets(), "select only the one to vary")
+            around, *others = _targets()
+            if others:
+                raise ValueError(f"{len(others) + 1} variations are selected: select only the one to vary")
             like = {"person": str(around.person), "amount": settings.amount, "title": f"Like seed {around.seed}"}
-        from_panel = settings.seeds != "RANDOM" and not self.like
-        first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
-        fields = sampling(context.scene.primdiffusion)
-        if settings.quality == "DRAFT":
-            fields |= zip(("steps", "sampler"), STEPS_AND_SAMPLER["DRAFT"], strict=True)
-        return submit(self, context, VariationsJob(_seeds(first, int(settings.count)), fields, **like))
-
-    def _use_seed(self, settings: bpy.types.PropertyGroup) -> set[str]:
-        wanted = _only(_targets(), "select one")
-        if sheet.around:
-            raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
-        settings.seed, settings.keep_seed = wanted.seed, True
-        bpy.ops.ed.undo_push(message="Use Seed")
-        return {"FINISHED"}
+        seeds = _seeds(self.seed, int(settings.count))
+        return submit(self, context, VariationsJob(seeds, sampling(context.scene.primdiffusion), **like))
 
 
 def _seeds(first: int, count: int) -> tuple[int, ...]:
@@ -125,11 +80,6 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
 
     bl_idname = "primdiffusion.build_variation"
     bl_label = "Build Selected"
-    described_by = ("build_all",)
-
-    build_all: bpy.props.BoolProperty(
-        name="All", description="Add all of these humans to the scene, side by side", options=SKIP
-    )
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -138,7 +88,7 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
         return bool(sheet.variations)
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        wanted = list(sheet.variations) if self.build_all else _targets()
+        wanted = _targets()
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         built, failure = _build(context, wanted)
@@ -155,12 +105,6 @@ def _targets() -> list[Variation]:
     if not sheet.variations:
         raise ValueError("there are no variations: press Show Variations first")
     return sheet.chosen()
-
-
-def _only(wanted: list[Variation], what_to_do: str) -> Variation:
-    if len(wanted) > 1:
-        raise ValueError(f"{len(wanted)} variations are selected: {what_to_do}")
-    return wanted[0]
 
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Object], str]:
@@ -206,8 +150,6 @@ def draw_variations(layout: bpy.types.UILayout, context: bpy.types.Context) -> N
     settings = context.scene.primdiffusion_variations
     column = layout.column()
     column.row().prop(settings, "count", expand=True)
-    column.prop(settings, "seeds")
-    column.prop(settings, "quality")
     draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
     job = queue.current.job if queue.current is not None else None
     if job is not None and job.kind == "variations":
@@ -263,13 +205,8 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
         translate=False,
         icon="OUTLINER_OB_ARMATURE",
     )
-    row = layout.row(align=True)
-    row.operator("primdiffusion.build_variation", text="Build All").build_all = True
-    row.operator("primdiffusion.variations", text="Clear", icon="TRASH").clear = True
-    row = row_unless(layout, "" if number == 1 else "Select one human for these")
+    row = row_unless(layout, "" if number == 1 else "Select one human for this")
     row.operator("primdiffusion.variations", text="More Like This", icon="DUPLICATE").like = True
-    if not sheet.around:
-        row.operator("primdiffusion.variations", text="Use Seed", icon="COPYDOWN").use_seed = True
     layout.prop(settings, "amount")
 
 

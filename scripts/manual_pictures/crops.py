@@ -16,11 +16,11 @@ PANELS = {
     "attributes": ("generate_attributes",),
     "variations": ("variations_empty", "variations_denoising", "variations_selected"),
     "shape": ("human_shape_before", "human_shape_after"),
-    "details": ("human_details", "human_assets"),
+    "details": ("human_details",),
     "edits": ("edit_parts", "edit_two_people"),
     "motion": ("motion_empty", "motion_imported"),
     "render": ("render_cycles", "render_merged", "render_outdated"),
-    "captures": ("captures_cameras", "captures_output", "captures_human"),
+    "captures": ("captures_settings",),
     "export": ("export_before", "export_proxy"),
 }
 """Rows of sidebars, cropped to their panels."""

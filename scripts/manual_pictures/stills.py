@@ -74,7 +74,9 @@ def reshaped(folder: Path) -> list[Path]:
     scene = _stage(folder, 12, "Relaxed")
     pictures = []
     for number, (height, weight) in enumerate(((1.55, 80.0), (1.72, 68.0), (1.9, 75.0))):
-        bpy.ops.primdiffusion.reshape(height=height, weight=weight)
+        settings = bpy.context.object.primdiffusion_human
+        settings.height = height
+        settings.weight = weight
         pictures.append(render(scene, folder / f"{number}.png", SIZE))
     return pictures
 

@@ -31,7 +31,8 @@ def five_humans(module: str, python: str) -> Steps:
     yield from at_rest(module)
     yield "five_local"
     press("view3d.localview", "EXEC_DEFAULT")
-    press("primdiffusion.add_camera")
+    press("object.select_all", "EXEC_DEFAULT", action="SELECT")
+    press("view3d.camera_to_view_selected", "EXEC_DEFAULT")
     press("view3d.view_camera", "EXEC_DEFAULT")
     yield from at_rest(module)
     yield "five_camera"
@@ -170,8 +171,9 @@ def cancelled_captures(module: str, python: str) -> Steps:
     yield from show("PRIMDIFFUSION_PT_captures")
     settings = bpy.context.scene.primdiffusion_captures
     settings.people, settings.out = str(folder / "people"), str(folder / "captures")
-    captures = import_module(f"{module}.ui.captures_settings").captures
-    press("primdiffusion.render_captures", "EXEC_DEFAULT", options="--size 128 128")
+    settings.width = settings.height = 128
+    captures = import_module(f"{module}.ui.captures_panel").captures
+    press("primdiffusion.render_captures", "EXEC_DEFAULT")
 
     def pictures() -> int:
         return len(list((folder / "captures").rglob("*.png")))
@@ -184,7 +186,7 @@ def cancelled_captures(module: str, python: str) -> Steps:
     if captures.busy or not before:
         raise RuntimeError(f"after Cancel: busy {captures.busy}, {before} pictures")
     yield "captures_stopped"
-    press("primdiffusion.render_captures", "EXEC_DEFAULT", options="--size 128 128")
+    press("primdiffusion.render_captures", "EXEC_DEFAULT")
     yield from wait(lambda: pictures() > before or not captures.busy, 240)
     if pictures() <= before:
         raise RuntimeError("the capture did not continue")

@@ -62,7 +62,7 @@ def drawn(module: str, python: str, seed: int, name: str) -> Steps:
     (armature,) = armatures()
     select(armature)
     pose(armature, name)
-    press("primdiffusion.add_camera")
+    press("view3d.camera_to_view_selected", "EXEC_DEFAULT")
     scene = bpy.context.scene
     scene.render.engine, scene.render.film_transparent = "PRIMDIFFUSION", True
     scene.render.resolution_x, scene.render.resolution_y = _SIZE

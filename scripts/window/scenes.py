@@ -131,10 +131,8 @@ def variations(module: str, python: str) -> Steps:
     """Eight in progress, the sheet, two selected."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_generate/variations")
-    bpy.context.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
-    bpy.context.scene.primdiffusion.seed = 40
     yield "variations_empty"
-    press("primdiffusion.variations")
+    press("primdiffusion.variations", seed=40)
     queue = queue_of(module)
     yield from wait(lambda: queue.request is not None and bool(queue.request.pictures), 120)
     yield 0.5
@@ -144,11 +142,10 @@ def variations(module: str, python: str) -> Steps:
     for index in (1, 5):
         bpy.context.window_manager.primdiffusion_selected[index] = True
     yield "variations_selected"
-    press("primdiffusion.variations", clear=True)
 
 
 def human(module: str, python: str) -> Steps:
-    """Shape before and after, facts, poses, assets."""
+    """Shape before and after, facts, poses."""
     yield from with_people(module, python, FIRST_SEED)
     armature = armatures()[0]
     yield from show("PRIMDIFFUSION_PT_human/shape")
@@ -173,8 +170,6 @@ def human(module: str, python: str) -> Steps:
     yield from at_rest(module)
     yield "human_poses"
     press("object.posemode_toggle")
-    yield from show("PRIMDIFFUSION_PT_export/assets")
-    yield "human_assets"
 
 
 def edits(module: str, python: str) -> Steps:
@@ -256,27 +251,16 @@ def render(module: str, python: str) -> Steps:
 
 
 def captures(module: str, python: str) -> Steps:
-    """Render Captures with its cameras, Human from Captures."""
+    """Render Captures with its settings."""
     yield from begin(module, python)
     bpy.context.preferences.addons[module].preferences.captures = True
-    yield from show("PRIMDIFFUSION_PT_captures/captures_cameras", "PRIMDIFFUSION_PT_captures/captures_poses")
+    yield from show("PRIMDIFFUSION_PT_captures")
     for name in ("people", "out"):
         folder = Path(tempfile.gettempdir()) / "shots" / {"people": "scans", "out": "captures"}[name]
         folder.mkdir(exist_ok=True, parents=True)
         setattr(bpy.context.scene.primdiffusion_captures, name, str(folder))
-    press("primdiffusion.preview_rig")
     yield 1.0
-    yield "captures_cameras"
-    press("primdiffusion.preview_rig")
-    settings = bpy.context.scene.primdiffusion_captures
-    settings.light, settings.hdri, settings.background = "hdri", str(Path(tempfile.gettempdir()) / "skies"), "hdri"
-    yield from show(*(f"PRIMDIFFUSION_PT_captures/captures_{name}" for name in ("input", "cycles", "output")))
-    yield "captures_output"
-    yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_human_from_captures")
-    bpy.context.scene.primdiffusion_reconstruct.capture = "/nowhere/captures"
-    press("primdiffusion.human_from_captures")
-    yield from wait(lambda: not queue_of(module).busy, 60)
-    yield "captures_human"
+    yield "captures_settings"
 
 
 def export(module: str, python: str) -> Steps:

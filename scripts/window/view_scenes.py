@@ -117,13 +117,8 @@ def rendered(module: str, python: str) -> Steps:
     print(f"turning and refining: {measured.end()}", flush=True)
     yield "rendered_turned"
     around.view_perspective = "ORTHO"
-    space = area.spaces.active
-    space.use_render_border = True
-    space.render_border_min_x, space.render_border_max_x = 0.2, 0.7
-    space.render_border_min_y, space.render_border_max_y = 0.2, 0.8
     yield 20.0
     yield "rendered_parallel"
-    space.use_render_border = False
     bpy.context.scene.primdiffusion_render.view = "ALPHA"
     yield 5.0
     yield "rendered_says_that_alpha_is_for_renders"

@@ -3,6 +3,7 @@ pixels that neither other objects nor panels hide."""
 
 from __future__ import annotations
 
+import gc
 from importlib import import_module
 
 import bpy
@@ -103,8 +104,9 @@ def layers() -> list[bpy.types.LayerCollection]:
 def at_rest(module: str) -> Steps:
     """Until the views show their finest pictures, those that the engine draws too."""
     overlay = import_module(f"{module}.engine.gpu.overlay").overlay
-    rendered = import_module(f"{module}.engine.viewport")._viewports
+    kind = import_module(f"{module}.engine.viewport").Viewport
     yield 1.0
+    rendered = [each for each in gc.get_objects() if isinstance(each, kind)]  # Blender alone holds the engines
     yield from wait(lambda: overlay.resting and all(view.resting for view in rendered), _MOST_S)
     yield 1.0
 

@@ -26,7 +26,7 @@ import sidebar
 from blender_primdiffusion.motion.placing import FACTS
 from blender_primdiffusion.places import EXTENSION
 from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, volume_nodes
-from blender_primdiffusion.scene.build import STAND_IN, build_human
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import (
     BETAS,
@@ -41,7 +41,6 @@ from blender_primdiffusion.scene.human import (
     parts_of,
 )
 from blender_primdiffusion.scene.volume_nodes import open_humans, write_volumes
-from blender_primdiffusion.ui.drawing import DATA
 
 COUNT = 3
 """Volumes of the human."""
@@ -146,19 +145,15 @@ HOLDERS: dict[str, Callable[[], Any]] = {
     volume_nodes.VOLUMES_MARK: _with(volume_nodes.VOLUMES_MARK),
     splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
     splats.CELLS_MARK: _with(splats.CELLS_MARK),
-    STAND_IN: _with(STAND_IN),
     FACTS: lambda: bpy.data.actions["Walk"],
 }
 """What holds each custom property."""
 SETTINGS = {
-    "primdiffusion_captures": ("body", "people", "out", "poses", "hdri"),
+    "primdiffusion_captures": ("people", "out", "body", "poses", "hdri"),
     "primdiffusion_picture": ("mask",),
-    "primdiffusion_reconstruct": ("capture",),
 }
 """Paths among the scene's settings."""
-TEXTS = {"primdiffusion_reconstruct": ("subject",)}
-"""Names among the scene's settings that become part of a path."""
-PREFERENCES = ("backend_python", "checkpoint", "encoder")
+PREFERENCES = ("backend_python", "checkpoint")
 """Paths in the preferences."""
 
 
@@ -220,7 +215,6 @@ PROPERTIES: dict[str, Callable[[object], None]] = {
     "library.filepath": _set_library,
     "armature.name": _set_name,
     **{f"{group}.{name}": _set_setting(group, name) for group, names in SETTINGS.items() for name in names},
-    **{f"{group}.{name}": _set_setting(group, name) for group, names in TEXTS.items() for name in names},
     **{f"preferences.{name}": _set_preference(name) for name in PREFERENCES},
 }
 """How each is set, as a stranger would."""
@@ -264,7 +258,7 @@ def panels_fault() -> str:
     """Which panel cannot be drawn, or draws what Blender cannot show; empty when all can."""
     for cls in [*sidebar.panels(), *_menus()]:
         try:
-            shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or getattr(cls, "bl_category", "") == DATA
+            shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or cls.__name__ == "PRIMDIFFUSION_PT_captures"
             if not shown:
                 continue
             texts = sidebar.draw(cls, bpy.context, opened=True).texts
@@ -282,7 +276,6 @@ def _menus() -> list[type]:
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
     ("set_representation", {"representation": "VOLUMES"}), ("reshape", {"to": "GENERATED"}),
-    ("human_from_captures", {}), ("verify_captures", {}),
     ("set_representation", {"representation": "NO_MESH"}), ("merge", {"what": "NOTHING"}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""

@@ -1,6 +1,6 @@
 """Run by test_setup_installed in a Blender of its own: install the zip, set up its backend, generate, repair, report.
 
-python installed_set_up.py ZIP FOLDER_OF_WHEELS_OR_EMPTY
+python installed_set_up.py ZIP
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bpy
 
-archive, wheels = sys.argv[1:]
+(archive,) = sys.argv[1:]
 os.environ.pop("PRIMDIFFUSION_PYTHON", None)
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
 (module,) = [name for name in bpy.context.preferences.addons.keys() if name.endswith(".primdiffusion")]  # noqa: SIM118
@@ -26,30 +26,21 @@ report = {
     "root": str(places.set_up_folder().root),
     "before": preferences.known().state,
 }
-if wheels:
-    report["offline"] = not bpy.app.online_access
-    press = lambda: bpy.ops.primdiffusion.set_up_backend(directory=wheels)  # noqa: E731
-else:
-    bpy.context.preferences.system.use_online_access = True
-    report["cost"] = setup.cost(setup.chosen()[1])
-    press = bpy.ops.primdiffusion.set_up_backend
+bpy.context.preferences.system.use_online_access = True
+report["cost"] = setup.cost(setup.chosen()[1])
 started = time.perf_counter()
-report["outcome"] = sorted(press())
+report["outcome"] = sorted(bpy.ops.primdiffusion.set_up_backend())
 report["seconds"] = round(time.perf_counter() - started, 1)
 report["after"] = preferences.known().state
 report["about"] = state_of(places.set_up_folder())[1]
-if not wheels:
-    bpy.ops.wm.save_as_mainfile(filepath=str(Path(os.environ["BLENDER_USER_RESOURCES"]) / "shot.blend"))
-    started = time.perf_counter()
-    bpy.context.scene.primdiffusion.steps = 3
-    report["generated"] = sorted(bpy.ops.primdiffusion.generate(seed=3))
-    report["seconds_generate"] = round(time.perf_counter() - started, 1)
-    report["bones"] = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
+bpy.ops.wm.save_as_mainfile(filepath=str(Path(os.environ["BLENDER_USER_RESOURCES"]) / "shot.blend"))
 started = time.perf_counter()
-repair = (
-    press if wheels else lambda: bpy.ops.primdiffusion.set_up_backend(repair=True)
-)  # without a network, from the folder again
-report["repaired"] = sorted(repair())
+bpy.context.scene.primdiffusion.steps = 3
+report["generated"] = sorted(bpy.ops.primdiffusion.generate(seed=3))
+report["seconds_generate"] = round(time.perf_counter() - started, 1)
+report["bones"] = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
+started = time.perf_counter()
+report["repaired"] = sorted(bpy.ops.primdiffusion.set_up_backend(repair=True))
 report["seconds_repair"] = round(time.perf_counter() - started, 1)
 report["at_last"] = preferences.known().state
 bpy.ops.preferences.addon_disable(module=module)

@@ -51,11 +51,10 @@ bone.rotation_euler = (0, 0, 1)
 bone.keyframe_insert("rotation_euler", frame=1)
 posed = centres()
 
-report["reshaped"] = sorted(press.reshape(betas=[2.0] + [0.0] * 9))
+armature.primdiffusion_human.betas = [2.0] + [0.0] * 9
 reshaped = centres()
 report["moved"] = [float(np.abs(after - before).max()) for before, after in ((rest, posed), (posed, reshaped))]
 file = folder / "again.human"
-bpy.context.scene.primdiffusion_export.compact = True
 report["exported"] = sorted(press.export(filepath=str(file)))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import bpy
 
-_WITHIN_A_ROW = {"PRIMDIFFUSION_PG_captures.shards"}
+_WITHIN_A_ROW: set[str] = set()
 """Labels that are words between two numbers: 0 of 4."""
 _BLENDERS = frozenset(bpy.types.Operator.bl_rna.properties.keys()) | {"name", "rna_type"}
 _FROM_BLENDER = {"filepath", "directory", "files", "check_existing", "filter_glob", "remove_active", "remove_name"}

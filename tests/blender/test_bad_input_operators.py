@@ -24,7 +24,6 @@ from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import body_of, humans
-from blender_primdiffusion.ui.drawing import DATA
 
 ELSEWHERE = {"set_up_backend"}
 """Whatever is in the scene, it stays as it is."""
@@ -221,8 +220,8 @@ def outside(anna, monkeypatch):
 def _asked(monkeypatch, folder: Path) -> None:
     """Works are asked for their parameters, and then end well: what the child does is for other tests."""
     from blender_primdiffusion.jobs import follow
+    from blender_primdiffusion.jobs.error_log import error_in_the_scene
     from blender_primdiffusion.jobs.queue import JobOutcome, queue
-    from blender_primdiffusion.jobs.remedies import error_in_the_scene
 
     def wait_for(entry):
         queue.waiting.remove(entry)
@@ -315,7 +314,7 @@ def test_every_panel_draws(anna, situation):
         if not (cls.__name__.startswith("PRIMDIFFUSION_PT_") and cls.is_registered):
             continue
         try:
-            asked_for = getattr(cls, "bl_category", "") == DATA  # by a preference, whatever is in the scene
+            asked_for = cls.__name__ == "PRIMDIFFUSION_PT_captures"  # by a preference, whatever is in the scene
             if asked_for or not hasattr(cls, "poll") or cls.poll(bpy.context):
                 drawn += 1
                 cls.draw(_Drawn(cls), bpy.context)

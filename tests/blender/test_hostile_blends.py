@@ -176,12 +176,11 @@ def test_a_python_with_its_whole_path_is_taken(beside):
 
 
 @pytest.mark.any_blender
-@pytest.mark.parametrize("name", ["checkpoint", "encoder"])
-def test_a_model_beside_the_file_is_not_taken(beside, name):
+def test_a_model_beside_the_file_is_not_taken(beside):
     _, preferences = beside
-    setattr(preferences, name, "//model.safetensors")
-    with refused(ValueError, name, "'//model.safetensors'"):
-        chosen_checkpoint(name)
+    preferences.checkpoint = "//model.safetensors"
+    with refused(ValueError, "checkpoint", "'//model.safetensors'"):
+        chosen_checkpoint()
     assert not panels_fault()
-    setattr(preferences, name, "/models/a.safetensors")
-    assert chosen_checkpoint(name) == "/models/a.safetensors"
+    preferences.checkpoint = "/models/a.safetensors"
+    assert chosen_checkpoint() == "/models/a.safetensors"

@@ -26,7 +26,7 @@ READS = {
     "import_human": ("filepath", (".human", ".human.safetensors", ".npz")),
 }
 """Operators that read a file: the property with its path, and endings."""
-WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
+WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human"))]
 """Operators that write the file of their `filepath`."""
 FOLDERS = {"set_up_backend"}
 """Operators on the folder of their `directory`."""

@@ -11,10 +11,8 @@ from primdiffusion.human import Human, place
 from primdiffusion.human_file import load_human, save_body, save_human
 from primdiffusion.primitives.anchors import default_anchors
 
-from blender_primdiffusion.jobs.export import opened
 from blender_primdiffusion.scene.human_file import (
     body_arrays,
-    compacted,
     default_body,
     expanded,
     read_human,
@@ -54,31 +52,14 @@ def test_a_human_at_rest_is_the_backends_in_the_t_pose(human, tmp_path):
     assert np.allclose(found.grids().half_extent, wanted.half_extent, atol=1e-6)
 
 
-def test_what_is_opened_is_a_whole_human(human, tmp_path):
-    save_human(tmp_path / "a.human", human, compact=True)
-    result = opened(tmp_path / "a.human", tmp_path)
-    assert np.allclose(read_human(result.person).payload.betas, human.betas)
-    assert load_human(result.person).betas.equal(human.betas)
-
-
 def test_a_compact_file_is_a_quarter_of_the_size_and_the_same_to_both_programs(human, tmp_path):
-    plain, ours, theirs = (tmp_path / name for name in ("plain.human", "ours.human", "theirs.human"))
+    plain, compact = (tmp_path / name for name in ("plain.human", "compact.human"))
     save_human(plain, human)
-    save_human(theirs, human, compact=True)
-    write_tensors(ours, compacted(read_tensors(plain)))
-    assert theirs.stat().st_size < 0.26 * plain.stat().st_size
-    payload = load_human(theirs).payload
-    for path in (ours, theirs):
-        assert np.array_equal(read_payload(path).rgb, payload.rgb.numpy())
-        assert np.array_equal(read_payload(path).density, load_human(ours).payload.density.numpy())
+    save_human(compact, human, compact=True)
+    assert compact.stat().st_size < 0.26 * plain.stat().st_size
+    payload = load_human(compact).payload
+    assert np.array_equal(read_payload(compact).rgb, payload.rgb.numpy())
+    assert np.array_equal(read_payload(compact).density, payload.density.numpy())
     assert (payload.density.sqrt() - human.payload.density.sqrt()).abs().max() <= 10 / 255
-    write_tensors(tmp_path / "again.human", expanded(read_tensors(theirs)))
+    write_tensors(tmp_path / "again.human", expanded(read_tensors(compact)))
     assert torch.equal(load_human(tmp_path / "again.human").payload.rgb, payload.rgb)
-
-
-def test_humans_on_other_bodies_are_left_to_the_backend(human, tmp_path):
-    save_human(tmp_path / "a.human", human)
-    tensors = read_tensors(tmp_path / "a.human")
-    other = dataclasses.replace(tensors, metadata={**tensors.metadata, "body": "{}", "format_version": "2"})
-    write_tensors(tmp_path / "b.human", other)
-    assert opened(tmp_path / "b.human", tmp_path) is None

@@ -2,9 +2,9 @@
 
 import json
 import os
-import re
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +34,6 @@ from blender_primdiffusion.backend.packages import (
     chosen_compute,
     locks_for,
     read_lock,
-    this_machine,
 )
 from blender_primdiffusion.backend.requests import Backend, ChildRequest, Steps
 
@@ -47,25 +46,20 @@ class Place(NamedTuple):
     lock: Path
     cache: Path
 
-    def from_folder(self) -> Steps:
-        return self._set_up(self.wheels)
-
-    def from_index(self) -> Steps:
-        return self._set_up(None)
-
-    def _set_up(self, wheels: Path | None) -> Steps:
-        return setup.set_up(self.folder, read_lock(self.lock), "cpu", FAKE_CHILD, self.cache, wheels)
+    def steps(self) -> Steps:
+        return setup.set_up(self.folder, read_lock(self.lock), "cpu", FAKE_CHILD, self.cache)
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch) -> Place:
-    """A folder with a space and an umlaut, and one of wheels."""
+def place(tmp_path, monkeypatch) -> Iterator[Place]:
+    """A folder with a space and an umlaut, and an index that serves one of wheels."""
     monkeypatch.delenv(VARIABLE, raising=False)
-    own_index(monkeypatch)
     with_this_pip(monkeypatch, setup)
     lock = write_lock(tmp_path / "lock.txt", write_packages(tmp_path / "räder"))
     root = tmp_path / "Menschen für Blender"
-    return Place(SetUpFolder(root), tmp_path / "räder", lock, root / "cache")
+    with served(tmp_path / "räder") as (index, _):
+        own_index(monkeypatch, index)
+        yield Place(SetUpFolder(root), tmp_path / "räder", lock, root / "cache")
 
 
 def done(steps: Steps) -> str:
@@ -80,8 +74,8 @@ def failed(steps: Steps) -> str:
     return str(error.value)
 
 
-def test_an_environment_is_made_of_a_folder_of_wheels_tested_and_marked_ready(place):
-    assert done(place.from_folder()).startswith("The backend is ready: torch 0-tiny on fake device")
+def test_an_environment_is_made_tested_and_marked_ready(place):
+    assert done(place.steps()).startswith("The backend is ready: torch 0-tiny on fake device")
     state, about = state_of(place.folder)
     assert state == "ready"
     assert (about["packages"], about["compute"], about["device"]) == (2, "cpu", "fake device")
@@ -95,7 +89,7 @@ def test_an_environment_is_made_of_a_folder_of_wheels_tested_and_marked_ready(pl
 def test_an_environment_may_have_a_pip_of_its_own(place, monkeypatch):
     monkeypatch.setattr(setup, "_VENV", setup._VENV[:-1])
     monkeypatch.setattr(setup, "_pip", lambda python: [str(python), "-I", "-m", "pip"])
-    assert done(place.from_folder())
+    assert done(place.steps())
     assert list(place.folder.environment.rglob("pip-*.dist-info"))
 
 
@@ -106,33 +100,28 @@ def test_what_a_link_leads_to_is_not_emptied(place, tmp_path, name):
     link = getattr(place.folder, name)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(own.parent, target_is_directory=True)
-    assert failed(place.from_folder()).endswith(
-        "is a link to another folder: remove the link, then set the backend up again"
-    )
+    assert failed(place.steps()).endswith("is a link to another folder: remove the link, then set the backend up again")
     assert own.read_text() == "mine"
 
 
 def test_setting_up_again_mends_a_damaged_environment(place):
-    done(place.from_folder())
+    done(place.steps())
     module = next(place.folder.environment.rglob("tiny.py"))
     good = module.read_bytes()
     module.write_text("PROBLEM = None  # and more")
-    done(place.from_folder())
+    done(place.steps())
     assert next(place.folder.environment.rglob("tiny.py")).read_bytes() == good
 
 
-def test_a_wheel_that_is_not_the_locked_one_is_not_installed(place, monkeypatch):
+def test_a_wheel_that_is_not_the_locked_one_is_not_installed(place):
     write_wheel(place.wheels, "torch", "__version__ = 'evil'\n")
-    assert "hash differs" in failed(place.from_folder())
-    with served(place.wheels) as (index, _):
-        own_index(monkeypatch, index)
-        assert "torch is not the right one (its hash differs)" in failed(place.from_index())
+    assert "torch is not the right one (its hash differs)" in failed(place.steps())
     assert state_of(place.folder)[0] == "broken"
     assert not list(place.folder.environment.rglob("torch.py"))
 
 
 def test_pip_gets_the_lock_as_it_was_checked(place):
-    steps = place.from_folder()
+    steps = place.steps()
     place.lock.write_text("--index-url http://localhost:9/\nevil==1\n")
     assert done(steps).startswith("The backend is ready")
     place.lock.write_text("--index-url http://localhost:9/\nevil==1\n")
@@ -140,31 +129,16 @@ def test_pip_gets_the_lock_as_it_was_checked(place):
         read_lock(place.lock)
 
 
-@pytest.mark.parametrize(
-    ("name", "put", "error"),
-    [
-        ("links.HTM", lambda path: path.write_text('<a href="http://localhost:9/torch-9.whl">'), RuntimeError),
-        ("idna-3.10-py3-none-any.whl", Path.mkdir, IsADirectoryError),
-        pytest.param("torch-9-py3-none-any.whl", lambda path: os.mkfifo(path), PermissionError, marks=pytest.mark.unix),
-    ],
-)
-def test_what_is_no_wheel_is_named_before_anything_is_made(place, name, put, error):
-    put(place.wheels / name)
-    with refused(error, name):
-        done(place.from_folder())
-    assert not place.folder.root.exists()
-
-
-def test_a_wheel_that_is_missing_in_the_folder_is_named(place):
+def test_a_wheel_that_the_index_lacks_is_named(place):
     next(place.wheels.glob("torch-*")).unlink()
-    assert failed(place.from_folder()).startswith("there is no torch")
+    assert failed(place.steps()).startswith("there is no torch")
 
 
 def test_a_cancel_ends_pip_at_once_and_the_next_try_fetches_only_what_is_missing(place, monkeypatch):
     others = set(psutil.Process().children())
     with served(place.wheels, stalls="torch") as (index, handler):
         own_index(monkeypatch, index)
-        steps = place.from_index()
+        steps = place.steps()
         until(lambda: next(steps) and any(path.startswith("/torch-") for path in handler.asked))
         processes = set(psutil.Process().children()) - others
         assert processes
@@ -173,7 +147,7 @@ def test_a_cancel_ends_pip_at_once_and_the_next_try_fetches_only_what_is_missing
         assert state_of(place.folder)[0] == "broken"
         handler.stalls = ""
         handler.asked.clear()
-        done(place.from_index())
+        done(place.steps())
         assert [path for path in handler.asked if path.endswith(".whl")] == ["/torch-1.0-py3-none-any.whl"]
     assert state_of(place.folder)[0] == "ready"
 
@@ -186,7 +160,7 @@ def _alive(process: psutil.Process) -> bool:
 
 
 def test_an_environment_whose_blender_or_mark_is_gone_is_not_used(place, tmp_path):
-    done(place.from_folder())
+    done(place.steps())
     mark = place.folder.environment / MARK
     mark.write_text(json.dumps({**json.loads(mark.read_text()), "base": str(tmp_path / "old blender/python")}))
     assert state_of(place.folder)[0] == "broken"
@@ -197,7 +171,7 @@ def test_an_environment_whose_blender_or_mark_is_gone_is_not_used(place, tmp_pat
 
 def test_an_environment_that_fails_its_self_test_is_not_ready(place):
     write_lock(place.lock, write_packages(place.wheels, problem="the graphics card is on fire"))
-    assert failed(place.from_folder()) == "the self-test failed: the graphics card is on fire"
+    assert failed(place.steps()) == "the self-test failed: the graphics card is on fire"
     assert state_of(place.folder)[0] == "broken"
 
 
@@ -224,7 +198,7 @@ def _client(cache: Path) -> BackendClient:
 
 def test_no_network_is_a_sentence(place, monkeypatch):
     own_index(monkeypatch)
-    assert failed(place.from_index()).startswith("the package index cannot be reached")
+    assert failed(place.steps()).startswith("the package index cannot be reached")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="shell scripts")
@@ -233,7 +207,7 @@ def test_a_python_that_cannot_make_an_environment_is_named(place, tmp_path, monk
     host.write_text('#!/bin/sh\necho "No module named venv"\nexit 1\n')
     host.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(host))
-    message = failed(place.from_folder())
+    message = failed(place.steps())
     assert str(host) in message
     assert "python3-venv" in message
     assert state_of(place.folder)[0] == "absent"
@@ -243,7 +217,7 @@ def test_a_python_that_cannot_make_an_environment_is_named(place, tmp_path, monk
 def test_a_damaged_list_of_packages_is_an_error_before_anything_is_made(place):
     place.lock.write_text("torch\n")
     with refused(ValueError, "line 1"):
-        place.from_folder()
+        place.steps()
     assert not place.folder.environment.exists()
 
 
@@ -252,7 +226,7 @@ def test_a_very_long_path_holds_an_environment(place, tmp_path):
         pytest.skip("there the environment goes to a short folder instead")
     root = tmp_path.joinpath(*["sehr lange"] * 24)
     assert len(str(root)) > 260
-    assert done(place._replace(folder=SetUpFolder(root)).from_folder())
+    assert done(place._replace(folder=SetUpFolder(root)).steps())
 
 
 ROOT = Path(__file__).parents[2]
@@ -314,10 +288,6 @@ def test_an_apple_computer_takes_its_own_packages():
 def test_what_cannot_be_is_rejected_in_a_sentence(machine, wish, available, message):
     with pytest.raises(ValueError, match=message):
         chosen_compute(machine, wish, available)
-
-
-def test_this_machine_is_described_without_starting_anything():
-    assert re.fullmatch(r"[\w ]+(, NVIDIA driver[ \d]*)?, Python 3\.\d+", this_machine().described)
 
 
 def test_the_environment_goes_to_a_short_folder_only_where_windows_needs_it():

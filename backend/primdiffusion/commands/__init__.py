@@ -20,7 +20,6 @@ FUNCTIONS = {
     "export": "export:export",
     "proxy": "export:proxy",
     "gaussians": "export:gaussians",
-    "open_human": "export:open_human",
     "merge": "merge:merge",
     "merge_frames": "merge:merge_frames",
     "info": "info:info",

@@ -1,4 +1,4 @@
-"""Humans as other files: `export`, `proxy`, `gaussians` and `open_human`."""
+"""Humans as other files: `export`, `proxy` and `gaussians`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import torch
 
 from primdiffusion.body.pose_file import read_pose
 from primdiffusion.commands.options import ExportCommand
-from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
 from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb, write_proxy_obj
 from primdiffusion.files.whole_files import staged
-from primdiffusion.formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
-from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
+from primdiffusion.formats.answers import GaussiansAnswer, ProxyAnswer
+from primdiffusion.formats.requests import GaussiansRequest, ProxyRequest
 from primdiffusion.human import Human, place_on_floor, place_skinned
 from primdiffusion.human_file import load_human
 
@@ -60,18 +59,6 @@ def gaussians(request: GaussiansRequest, session: Session, report: ReportProgres
     write_gaussians(request.out, splats)
     seconds = round(time.perf_counter() - began, 3)
     return GaussiansAnswer(out=request.out, gaussians=len(splats.opacity), seconds=seconds)
-
-
-def open_human(request: OpenHumanRequest, session: Session, report: ReportProgress) -> HumanAnswer:
-    """Write the files of `generate` for a saved human, all or none. Raises OSError, and as load_human."""
-    began = time.perf_counter()
-    with staged(request.out_dir) as folder:
-        report("load", 0, 1, None)
-        human = load_human(request.person)
-        report("write", 0, 1, None)
-        write_human(folder, human, request.size)
-        report("write", 1, 1, 0.0)  # the last chance to cancel
-    return HumanAnswer(**FILES.in_folder(request.out_dir), seconds=round(time.perf_counter() - began, 3))
 
 
 def _shaped(person: Path, betas: list[float] | None) -> Human:

@@ -270,7 +270,7 @@ class Message(Open):
 
 ANSWERS: dict[str, type] = {
     "hello": HelloAnswer,
-    **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer", "open_human"), HumanAnswer),
+    **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer"), HumanAnswer),
     "variations": VariationsAnswer,
     "attributes": AttributesAnswer,
     "reconstruct": ReconstructAnswer,

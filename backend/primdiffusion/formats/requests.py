@@ -526,14 +526,6 @@ class GaussiansRequest:
             raise FieldError(("object",), "and joints go together: give both, or neither for the T pose")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OpenHumanRequest(Previews):
-    """Write the files of `generate` for a saved human."""
-
-    person: Path
-    """A .human.safetensors file."""
-
-
 @dataclasses.dataclass(frozen=True)
 class CancelRequest:
     """Stop a running request."""
@@ -564,7 +556,6 @@ REQUESTS: dict[str, type] = {
     "merge_frames": MergeFramesRequest,
     "proxy": ProxyRequest,
     "gaussians": GaussiansRequest,
-    "open_human": OpenHumanRequest,
     "cancel": CancelRequest,
     "shutdown": NoParameters,
 }

@@ -12,16 +12,11 @@ from numpy.typing import NDArray
 from .march import GpuMarch
 from .shaders import cache_until_exit
 
-NO_PLANES: NDArray[np.float32] = np.zeros((1, 4), np.float32)
 _NOTHING = "1e9"
 """Depths beyond are pixels without a surface."""
-_OPAQUE = "0.9"
-"""From this alpha on a picture that is drawn again hides what was drawn between."""
 Part = tuple[float, float, float, float]
 """Left, bottom, right and top of a part of the region, as fractions of it."""
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
-_AGAIN, _XRAY = 1, 2
-"""Modes of the shader: as `ViewLook.again`; before everything but bones in front."""
 _CORNERS = 10
 """Of the polygon for a joint."""
 
@@ -37,7 +32,7 @@ _FRAGMENT = f"""
 void main()
 {{
   vec4 light = texture(colour, uv);
-  if (light.a < 0.002 || (mode == {_AGAIN} && light.a < {_OPAQUE})) {{
+  if (light.a < 0.002) {{
     discard;
     return;
   }}
@@ -51,24 +46,13 @@ void main()
     }}
   }}
   float far = 1.0;
-  if (mode == {_AGAIN} && metres > {_NOTHING}) {{
-    discard;
-    return;
-  }}
   if (metres < {_NOTHING}) {{
     float w = metres * lens.z + 1.0 - lens.z;
     far = clamp((lens.y - lens.x * metres) / w * 0.5 + 0.5, 0.0, 1.0);
-    vec4 point = vec4(((uv * 2.0 - 1.0) * w + middle.zw * metres - middle.xy) / scale, -metres, 1.0);
-    for (int i = 0; i < textureSize(planes, 0).x; i++) {{
-      if (dot(texelFetch(planes, ivec2(i, 0), 0), point) < 0.0) {{
-        discard;
-        return;
-      }}
-    }}
   }}
   bool outside = any(lessThan(uv, frame.xy)) || any(greaterThan(uv, frame.zw));
   light.rgb *= outside ? 1.0 - lens.w : 1.0;
-  gl_FragDepth = mode == {_XRAY} ? 1e-6 : far;
+  gl_FragDepth = xray != 0 ? 1e-6 : far;
   picture = light * opacity;
 }}
 """
@@ -83,25 +67,13 @@ class ViewLook:
     opacity: float = 1.0
     xray: bool = False
     """Objects do not hide humans."""
-    planes: NDArray[np.float32] = dataclasses.field(default_factory=lambda: NO_PLANES)
-    """Clipping planes [N, 4] in the view's space; what is on their negative side is not drawn."""
     frame: Part = WHOLE
     """The camera's picture."""
     darkening: float = 0.0
     """Outside of the frame."""
-    again: bool = False
-    """The picture is below the overlays already: only humans, where they are opaque, go above them, by their depth."""
 
 
-@dataclasses.dataclass(frozen=True)
-class PictureTextures:
-    """A picture as a `GpuMarch` has it, and others."""
-
-    colour: gpu.types.GPUTexture
-    depth: gpu.types.GPUTexture
-
-
-def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook, part: Part = WHOLE) -> None:
+def draw_picture(picture: GpuMarch, look: ViewLook, part: Part = WHOLE) -> None:
     """Draw a picture of the whole region, or a part of it, over the region, for handlers of the kind POST_VIEW.
 
     Blender's overlays are drawn before: their depth is in the buffer, but for those of objects in front. What is drawn
@@ -116,15 +88,9 @@ def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook, part: Part
     shader.uniform_sampler("colour", picture.colour)
     shader.uniform_sampler("depth", picture.depth)
     shader.uniform_float("lens", (matrix[2, 2], matrix[2, 3], 0.0 if parallel else 1.0, look.darkening))
-    shader.uniform_float("middle", (matrix[0, 3], matrix[1, 3], matrix[0, 2], matrix[1, 2]))
-    shader.uniform_float("scale", (matrix[0, 0], matrix[1, 1]))
     shader.uniform_float("frame", look.frame)
     shader.uniform_float("opacity", look.opacity)
-    shader.uniform_int("mode", _AGAIN if look.again else _XRAY if look.xray else 0)
-    planes = np.ascontiguousarray(look.planes, np.float32)
-    texels = gpu.types.Buffer("FLOAT", planes.size, planes.ravel())
-    clipping = gpu.types.GPUTexture((len(planes), 1), format="RGBA32F", data=texels)  # too large for push constants
-    shader.uniform_sampler("planes", clipping)
+    shader.uniform_int("xray", int(look.xray))
     left, bottom, right, top = (2 * edge - 1 for edge in part)
     corners = [(left, bottom), (right, bottom), (left, top), (right, top)]
     batch_for_shader(shader, "TRI_STRIP", {"pos": corners}).draw(shader)
@@ -177,14 +143,11 @@ def _picture_shader() -> gpu.types.GPUShader:
     info.vertex_out(between)
     info.sampler(0, "FLOAT_2D", "colour")
     info.sampler(1, "FLOAT_2D", "depth")
-    info.sampler(2, "FLOAT_2D", "planes")
     for kind, name in (
         ("VEC4", "lens"),
-        ("VEC4", "middle"),
         ("VEC4", "frame"),
-        ("VEC2", "scale"),
         ("FLOAT", "opacity"),
-        ("INT", "mode"),
+        ("INT", "xray"),
     ):
         info.push_constant(kind, name)
     info.fragment_out(0, "VEC4", "picture")

@@ -12,13 +12,11 @@ from collections.abc import Iterable
 import blf
 import bpy
 import numpy as np
-from mathutils import Vector
 from numpy.typing import NDArray
 
-from ...scene.convention import points_to_backend
-from ..boxes import Boxes, seen_part
-from ..view import NO_SURFACE_M, camera_frame, clip_of, region_view
-from .composite import NO_PLANES, PictureTextures, ViewLook, draw_picture, keep_bones
+from ..boxes import seen_part
+from ..view import camera_frame, region_view
+from .composite import ViewLook, draw_picture, keep_bones
 from .march import gpu_marcher
 from .refine import GpuRefinement, MarchRequest
 from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
@@ -106,25 +104,6 @@ class Overlay:
         complete = all(reading.complete for reading in self._readings.values())
         return complete and all(picture.resting for picture in self._regions.values()) and not self.undrawn
 
-    def object_at(self, context: bpy.types.Context, x: int, y: int) -> bpy.types.Object | None:
-        """The object whose human is under a pixel of the region; None where another object is in front."""
-        picture, reading = self._regions.get(context.region.as_pointer()), self.reading(context)
-        if picture is None or picture.shown is None or not reading.humans:
-            return None
-        depth = np.asarray(picture.shown.picture.depth.read(), np.float32)
-        row = y * depth.shape[0] // context.region.height
-        column = x * depth.shape[1] // context.region.width
-        if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]) or depth[row, column] >= NO_SURFACE_M:
-            return None
-        point = _point(context, x, y, float(depth[row, column]))
-        origin = _point(context, x, y, max(clip_of(np.array(context.region_data.window_matrix))[0], -1e3))
-        ray = Vector(point - origin)
-        hit = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, ray.normalized(), distance=ray.length)
-        if hit[0] and not context.space_data.shading.show_xray:
-            return None
-        nearest = min(reading.humans.values(), key=lambda human: _distance(human.placed[1], point))
-        return next((obj for obj in context.view_layer.objects if obj.session_uid == nearest.object_uid), None)
-
     def reading(self, context: bpy.types.Context) -> SceneReading:
         """What the space shows."""
         content = ViewContent.of(context)
@@ -162,12 +141,6 @@ def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
         to_window = np.array(around.window_matrix, np.float64) @ np.array(around.view_matrix, np.float64)
         pixel, size = context.preferences.system.pixel_size, (region.width, region.height)
         keep_bones(_in_pixels(bones, to_window, size), size, _STICK_PX * pixel, _JOINT_PX * pixel)
-
-
-def draw_above_overlays(context: bpy.types.Context, picture: PictureTextures) -> None:
-    """Draw a view's picture again where Blender's overlays, such as the grid, are behind a human."""
-    keep_bones_in_front(context, overlay.reading(context).bones)
-    draw_picture(picture, ViewLook(np.array(context.region_data.window_matrix, np.float64), again=True))
 
 
 def follow() -> None:
@@ -215,21 +188,6 @@ def _in_pixels(points: NDArray, matrix: NDArray, size: tuple[int, int]) -> NDArr
     return (clip[..., :2] / clip[..., 3:] + 1) / 2 * size
 
 
-def _point(context: bpy.types.Context, x: int, y: int, depth: float) -> NDArray[np.float64]:
-    """The point [3] at this depth (see `GpuMarch.depth`) under a pixel, in Blender's world."""
-    around, region = context.region_data, context.region
-    window, to_view = np.array(around.window_matrix, np.float64), np.array(around.view_matrix, np.float64)
-    w = window[3, 2] * -depth + window[3, 3]
-    ndc = np.array([2 * (x + 0.5) / region.width - 1, 2 * (y + 0.5) / region.height - 1])
-    across = (ndc * w + window[:2, 2] * depth - window[:2, 3]) / np.diag(window)[:2]
-    return (np.linalg.inv(to_view) @ [*across, -depth, 1.0])[:3]
-
-
-def _distance(boxes: Boxes, point: NDArray) -> float:
-    """Metres from a point in Blender's world to the nearest centre of a box."""
-    return float(np.linalg.norm(boxes.position - points_to_backend(point), axis=1).min())
-
-
 def _look(context: bpy.types.Context) -> ViewLook:
     around, shading = context.region_data, context.space_data.shading
     opacity, xray = 1.0, False
@@ -237,11 +195,8 @@ def _look(context: bpy.types.Context) -> ViewLook:
         opacity, xray = shading.xray_alpha, True
     if shading.type == "WIREFRAME" and shading.show_xray_wireframe:
         opacity, xray = max(shading.xray_alpha_wireframe, WIREFRAME_OPACITY), True
-    planes = NO_PLANES
-    if around.use_clip_planes:
-        planes = np.array(around.clip_planes, np.float64) @ np.linalg.inv(np.array(around.view_matrix, np.float64))
     window, space = np.array(around.window_matrix, np.float64), context.space_data
-    look = ViewLook(window, opacity, xray, planes)
+    look = ViewLook(window, opacity, xray)
     camera = space.camera if around.view_perspective == "CAMERA" and space.overlay.show_overlays else None
     if camera is None or camera.type != "CAMERA" or not camera.data.show_passepartout:
         return look

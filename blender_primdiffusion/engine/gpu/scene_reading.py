@@ -18,7 +18,7 @@ from ...scene.splats import SPLATS_MARK
 from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman, human_armatures, pose_of, visible_instances
-from ..who_draws import Drawer, who_draws
+from ..view import renders_volumes, view_engine
 from .march import GpuPayload
 from .shaders import cache_until_exit
 
@@ -112,7 +112,7 @@ class ViewContent:
     def of(cls, context: bpy.types.Context) -> ViewContent:
         """The content of the context's space."""
         space = context.space_data
-        by_volumes = who_draws(context.scene.render.engine, space.shading.type, True) is Drawer.VOLUMES
+        by_volumes = renders_volumes(view_engine(context.scene.render.engine, space.shading.type))
         types = frozenset(
             kind for kind in ("mesh", "volume", "pointcloud") if getattr(space, f"show_object_viewport_{kind}")
         )

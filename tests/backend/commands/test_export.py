@@ -1,17 +1,16 @@
-"""`primdiffusion export` and the child's jobs proxy, gaussians and open_human."""
+"""`primdiffusion export` and the child's jobs proxy and gaussians."""
 
 import numpy as np
 import pytest
 import splatter
-import torch
 import trimesh
 from export_people import person
 from primdiffusion import cli
-from primdiffusion.commands.export import gaussians, open_human, proxy
+from primdiffusion.commands.export import gaussians, proxy
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
+from primdiffusion.formats.requests import GaussiansRequest, ProxyRequest
 from primdiffusion.human import place, pose_body
-from primdiffusion.human_file import load_human, save_human
+from primdiffusion.human_file import save_human
 
 COARSE = ["--triangles", "800", "--texture", "64"]
 
@@ -78,12 +77,6 @@ def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):
     request = GaussiansRequest(person=saved, out=tmp_path / "p.ply", object=moved, joints=skinning, limit=2000)
     assert gaussians(request, Session(), silent).gaussians == 2000
     assert splatter.read_ply(tmp_path / "p.ply")["x"].mean() == pytest.approx(2.0, abs=0.1)
-
-
-def test_a_person_who_exists_gets_the_files_of_generate(saved, tmp_path):
-    result = open_human(OpenHumanRequest(person=saved, out_dir=tmp_path / "out", size=32), Session(), silent)
-    assert torch.equal(load_human(result.person).betas, person().betas)
-    assert all(path.is_file() for path in (result.person, result.preview, result.side, result.depth))
 
 
 def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):

@@ -1,25 +1,12 @@
-"""Errors of the child: advice on settings that cost memory."""
+"""Sentences on errors."""
 
 import pytest
 
-from blender_primdiffusion.backend.requests import error_text, memory_advice, sentence
+from blender_primdiffusion.backend.requests import error_text, sentence
 from blender_primdiffusion.console import Report, separate_stdout
 from blender_primdiffusion.ui import drawing
 
 pytestmark = pytest.mark.any_blender
-
-
-@pytest.mark.parametrize(
-    ("params", "advice"),
-    [
-        ({"views": 8}, "lower Views, or close other programs"),
-        ({"seeds": [1, 2], "steps": 3}, "lower Count, or close other programs (fewer Steps would not help)"),
-        ({"steps": 3}, "choose a smaller Checkpoint in the preferences (fewer Steps would not help)"),
-        ({"voxel": 0.01}, "raise Voxel Size, or close other programs"),
-    ],
-)
-def test_memory_advice_names_settings_that_cost_memory(params, advice):
-    assert memory_advice(params) == advice
 
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202egnp.exe"

@@ -19,11 +19,11 @@ def test_options_left_out_are_the_defaults_of_the_settings(tmp_path):
 
 
 def test_each_option_reaches_its_setting(tmp_path):
-    words = "--poses 3 --cameras 5 --fov 20 --margin 2 --samples 7 --together 2 --light dome --shadows --float-depth"
+    words = "--poses 3 --cameras 5 --fov 20 --margin 2 --samples 7 --together 2 --light dome --float-depth"
     settings = settings_of(parse(["--out", str(tmp_path), *words.split(), "--elevations", "-5", "5", "--denoise"]))
     rig = Rig(count=5, vertical_fov=20.0, margin=2.0, elevations=(-5.0, 5.0))
     assert settings == CaptureSettings(
-        tmp_path, rig=rig, pose_count=3, samples=7, together=2, light="dome", shadows=True, float_depth=True,
+        tmp_path, rig=rig, pose_count=3, samples=7, together=2, light="dome", float_depth=True,
         denoise=True,
     )  # fmt: skip
 

@@ -14,6 +14,14 @@ BEFORE, BEHIND, TORSO = (37, 48), (37, 60), (44, 43)
 """Pixels (row, column) of the cube before the person, of the one behind that looks out beside it, of bare torso."""
 
 
+def hold_out(scene, holds: bool) -> None:
+    """Whether the cubes of a scene cut holes, as the view layer's collections say."""
+    layer = scene.view_layers[0].layer_collection
+    if "solids" not in layer.children:
+        scene.collection.children.link(bpy.data.collections["solids"])
+    layer.children["solids"].holdout = holds
+
+
 @pytest.fixture
 def shot(extension, saved_scene, folder, tmp_path):
     """Two scenes with the same person, a red cube before, a blue one behind: one for Cycles, one for the engine."""
@@ -21,6 +29,11 @@ def shot(extension, saved_scene, folder, tmp_path):
     person = add_human(folder)
     cube("before", (0.0, -0.6, 1.2), 0.1).data.materials.append(material((0.8, 0.05, 0.05)))
     cube("behind", (0.15, 0.6, 1.2), 0.3).data.materials.append(material((0.05, 0.05, 0.8), "blue"))
+    solids = bpy.data.collections.new("solids")
+    for name in ("before", "behind"):
+        solids.objects.link(bpy.data.objects[name])
+        solid.collection.objects.unlink(bpy.data.objects[name])
+    solid.collection.children.link(solids)
     lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
     lamp.rotation_euler = (0.9, 0, 0.3)
     solid.collection.objects.link(lamp)
@@ -31,7 +44,7 @@ def shot(extension, saved_scene, folder, tmp_path):
     people = bpy.context.scene
     assert people is not solid
     people.render.engine = "PRIMDIFFUSION"
-    people.primdiffusion_render.solids = "HOLDOUT"
+    hold_out(people, True)
     people.render.film_transparent = True
     volumes_of(person).hide_render = True
     return SimpleNamespace(solid=solid, people=people, out=tmp_path / "picture")
@@ -80,7 +93,7 @@ def test_alpha_over_shows_what_stands_before_people_the_people_and_what_is_behin
 def test_depth_of_solids_is_cycles_to_a_centimetre(shot):
     for name, turn in (("before", (0.3, 0.2, 0.5)), ("behind", (0.1, 0.4, -0.6))):
         bpy.data.objects[name].rotation_euler = turn
-    shot.people.primdiffusion_render.solids = "SHADED"
+    hold_out(shot.people, False)
     next(obj for obj in shot.people.objects if obj.type == "ARMATURE").hide_render = True
     _, given = layers(shot, shot.people)
     _, cycles = layers(shot, shot.solid)

@@ -20,7 +20,7 @@ def stage(extension, saved_scene, tmp_path):
 
 
 def solids_now():
-    return scene_solids(bpy.context.evaluated_depsgraph_get(), False)
+    return scene_solids(bpy.context.evaluated_depsgraph_get())
 
 
 def test_a_cubes_triangles_are_in_the_backends_axes(stage):
@@ -194,7 +194,7 @@ def test_depth_is_the_nearer_of_person_and_cube(pair):
     assert depth.max() == np.float32(1e10)
 
 
-@pytest.mark.parametrize("way", ["object", "collection", pytest.param("setting", marks=pytest.mark.any_blender)])
+@pytest.mark.parametrize("way", ["object", "collection"])
 def test_a_holdout_cuts_a_hole_into_person_and_background(pair, way):
     stage, box = pair
     box.location.y = -0.8
@@ -202,28 +202,15 @@ def test_a_holdout_cuts_a_hole_into_person_and_background(pair, way):
     stage.scene.world = bpy.data.worlds.new("World")
     if way == "object":
         box.is_holdout = True
-    elif way == "collection":
+    else:
         masks = bpy.data.collections.new("masks")
         stage.scene.collection.children.link(masks)
         masks.objects.link(box)
         stage.scene.collection.objects.unlink(box)
         bpy.context.view_layer.layer_collection.children["masks"].holdout = True
-    else:
-        stage.scene.primdiffusion_render.solids = "HOLDOUT"
     picture = render_png(stage.out)
     assert not centre_of(box, picture).any()
     assert picture[0, 0, 3] == 255
-
-
-@pytest.mark.any_blender
-def test_solids_can_be_ignored(pair):
-    stage, box = pair
-    box.hide_render = True
-    alone = render_png(stage.out)
-    box.hide_render = False
-    box.location.y = -0.8
-    stage.scene.primdiffusion_render.solids = "IGNORED"
-    assert np.array_equal(render_png(stage.out), alone)
 
 
 @pytest.mark.parametrize(

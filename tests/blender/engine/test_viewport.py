@@ -1,4 +1,4 @@
-"""A Rendered view: what it says where it cannot be drawn, and which picture goes over Blender's overlays."""
+"""A Rendered view: what it says where it cannot be drawn, and how it is refined."""
 
 import time
 from pathlib import Path
@@ -39,7 +39,7 @@ class Engine:
 def drawn(addon):
     """Draws the scene, looking along y in parallel, at each call; what the view then says."""
     view, engine, matrix = Viewport(), Engine(), np.diag([1.0, 0.75, -0.01, 1.0])
-    space = SimpleNamespace(local_view=None, camera=None, use_render_border=False)
+    space = SimpleNamespace(local_view=None)
     to_view = np.array([[1.0, 0, 0, 0], [0, 0, 1, -1.0], [0, -1, 0, 0], [0, 0, 0, 1]])
     around = SimpleNamespace(window_matrix=matrix, view_matrix=to_view, view_perspective="PERSP")
     region = SimpleNamespace(as_pointer=lambda: 7, width=SIZE[0], height=SIZE[1])
@@ -82,14 +82,6 @@ def test_a_human_that_cannot_be_drawn_is_named_until_the_scene_changes(drawn, mo
     assert drawn.draw() == ""
 
 
-@pytest.mark.any_blender
-def test_a_view_says_where_renders_show_something_else(drawn, monkeypatch):
-    monkeypatch.setattr(drawn.view, "_march", lambda *_given: None)
-    assert drawn.draw() == ""
-    drawn.scene.primdiffusion_render.view = "BOXES"
-    assert drawn.draw() == "PrimDiffusion: 3D views show Colour; render the image to see Primitives"
-
-
 def refined(drawn) -> np.ndarray:
     """The picture [h, w, 4], from the bottom, once the view rests; drawn as often as the engine asks for it."""
     for draws in range(1, 500):
@@ -98,11 +90,11 @@ def refined(drawn) -> np.ndarray:
             break
         time.sleep(0.01)
     drawn.engine.redraws = 0
-    texture, _ = drawn.view._texture
+    texture = drawn.view._texture
     return np.array(texture.read()).reshape(texture.height, texture.width, 4)
 
 
-def test_a_view_is_refined_to_the_end_whole_and_in_part(marcher, drawn):
+def test_a_view_is_refined_to_the_end(marcher, drawn):
     drawn.scene.render.film_transparent = True
     human = build_human(bpy.context, SAMPLE)
     bpy.context.view_layer.update()
@@ -111,42 +103,6 @@ def test_a_view_is_refined_to_the_end_whole_and_in_part(marcher, drawn):
     assert drawn.view._refinement.shown.coarseness == 1
     assert drawn.view._refinement.shown.sample > 0
     assert 0.05 < (whole[..., 3] > 0.99).mean() < 0.3
-    drawn.space.use_render_border = True
-    drawn.space.render_border_min_x, drawn.space.render_border_max_x = 0.25, 0.75
-    drawn.space.render_border_min_y, drawn.space.render_border_max_y = 0.5, 1.0
-    assert np.abs(refined(drawn) - whole[32:, 12:36]).mean() < 0.01
-    drawn.space.use_render_border = False
     human.location.x = 5.0
     bpy.context.view_layer.update()
     assert not refined(drawn).any()
-
-
-def view_of(address: int, transform: str = "Standard", exposure: float = 0.0) -> SimpleNamespace:
-    settings = SimpleNamespace(view_transform=transform, look="None", exposure=exposure, gamma=1.0)
-    return SimpleNamespace(
-        scene=SimpleNamespace(view_settings=settings), region=SimpleNamespace(as_pointer=lambda: address)
-    )
-
-
-@pytest.fixture
-def shown():
-    """A viewport of region 7 that shows a marched picture."""
-    made = Viewport()
-    made.region, made._texture = 7, ("mean", None)
-    made._refinement.shown = SimpleNamespace(picture=SimpleNamespace(humans=SimpleNamespace(depth="depth")))
-    return made
-
-
-@pytest.mark.any_blender
-def test_the_marched_picture_has_the_colours_that_are_shown_and_the_humans_depth(shown):
-    picture = viewport.picture_above_overlays(view_of(7))
-    assert (picture.colour, picture.depth) == ("mean", "depth")
-    assert viewport.picture_above_overlays(view_of(8)) is None
-
-
-@pytest.mark.any_blender
-def test_colours_that_a_handler_cannot_show_stay_below(shown):
-    assert viewport.picture_above_overlays(view_of(7, "AgX")) is None
-    assert viewport.picture_above_overlays(view_of(7, exposure=1.0)) is None
-    shown._texture = ("mean", (0, 0, 8, 8))
-    assert viewport.picture_above_overlays(view_of(7)) is None

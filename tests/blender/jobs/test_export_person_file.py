@@ -12,8 +12,6 @@ from blender_primdiffusion.jobs.export import (
     AddProxyJob,
     ExportGaussiansJob,
     ExportMeshJob,
-    ExportVdbSequenceJob,
-    HumanAssetJob,
     posed_frames,
 )
 from blender_primdiffusion.jobs.generate import EditJob
@@ -41,8 +39,6 @@ def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
         ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", range(1, 4)),
         AddProxyJob(target, 512, 9000),
         ExportGaussiansJob(target, folder / "ä.ply", posed_frames(context, person, [1])[0], 500),
-        ExportVdbSequenceJob(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
-        HumanAssetJob(target),
     ]
 
 

@@ -1,15 +1,13 @@
-"""Memory of the child process and of Blender: what is shown, released and when."""
+"""The child's memory is released when it is idle."""
 
 from __future__ import annotations
 
 import os
 import time
-from types import SimpleNamespace
 
 import bpy
 import pytest
 from jobs_driven import drive, until_running
-from support.errors import refused
 from support.fake_child import TAKES_LONG
 
 from blender_primdiffusion.jobs import follow
@@ -40,60 +38,18 @@ def ended(pid: int, seconds: float = 300.0) -> bool:
     return False
 
 
-def test_release_ends_the_child_and_the_next_job_starts_another(addon):
-    pid = started_and_idle()
-    assert ops.cancel(what="MEMORY") == {"FINISHED"}
-    assert ended(pid)
-    assert ops.cancel(what="MEMORY") == {"FINISHED"}, "without a child too"
-    assert started_and_idle() not in (pid, None)
-    assert len(humans(bpy.context.scene)) == 2
-    assert queue.child_message == ""
-
-
-def test_memory_is_not_released_while_the_child_is_busy(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
-    until_running()
-    with refused(RuntimeError, "backend"):
-        ops.cancel(what="MEMORY")
-    assert queue.busy
-
-
-def test_an_idle_child_is_ended_after_the_minutes_of_the_preferences(addon, monkeypatch):
-    pid = started_and_idle()
-    begun = queue.idle_since
-    assert follow.idle_minutes() == 10.0
-    assert not follow.release_when_idle(begun + 599)
-    monkeypatch.setattr(follow, "idle_minutes", lambda: 0.0)
-    assert not follow.release_when_idle(begun + 10_000)
-    monkeypatch.setattr(follow, "idle_minutes", lambda: 10.0)
-    assert follow.release_when_idle(begun + 601)
-    assert ended(pid)
-    assert not follow.release_when_idle(begun + 700), "nothing is left to end"
-
-
-@pytest.mark.parametrize("renders", [False, True])
-def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, monkeypatch, renders):
-    started_and_idle()
-    freed = []
-    monkeypatch.setattr(follow, "free_unused_grids", lambda: freed.append(1))
-    monkeypatch.setattr(follow, "idle_minutes", lambda: 10.0)
-    with monkeypatch.context() as during:
-        during.setattr(follow, "bpy", SimpleNamespace(app=SimpleNamespace(is_job_running=lambda _: renders)))
-        assert follow.release_when_idle(queue.idle_since + 601)
-    assert len(freed) == (0 if renders else 1)
-
-
 def test_a_busy_child_is_never_idle(addon):
     queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
     until_running()
     assert not follow.release_when_idle(time.monotonic() + 10_000)
 
 
-def test_the_device_line_shows_what_is_known(addon):
-    assert follow.device_line() == "starts with the first human"
-    queue.info = {"device_name": "H200", "device_memory_gb": 139.8, "device_memory_free_gb": 120.04}
-    assert follow.device_line() == "H200, 139.8 GB, 120.0 GB free at its start"
-    queue.info = {"device_name": "CPU", "device_memory_gb": None, "memory_gb": 16.0, "memory_free_gb": None}
-    assert follow.device_line() == "CPU, 16.0 GB"
-    queue.info = {"device_name": "CPU"}
-    assert follow.device_line() == "CPU"
+def test_an_idle_child_is_ended_after_ten_minutes_and_the_next_job_starts_another(addon):
+    pid, begun = started_and_idle(), queue.idle_since
+    assert not follow.release_when_idle(begun + 599)
+    assert follow.release_when_idle(begun + 601)
+    assert ended(pid)
+    assert not follow.release_when_idle(begun + 700), "nothing is left to end"
+    assert started_and_idle() not in (pid, None)
+    assert len(humans(bpy.context.scene)) == 2
+    assert queue.child_message == ""

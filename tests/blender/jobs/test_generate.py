@@ -35,7 +35,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
     addon.scene.primdiffusion.steps = 3
     assert bpy.ops.primdiffusion.generate(seed=7) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    assert len(parts_of(person)) == 4
+    assert len(parts_of(person)) == 3
     sent = request_of(person_file(person))
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
     assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "guidance": 2.0, "size": 16, "picture_px": 256}
@@ -55,13 +55,12 @@ def test_what_the_human_does_not_show_is_said(addon):
     assert "not show" not in " ".join(panel_texts(addon))
 
 
-def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
+def test_the_view_frames_the_first_human_alone(addon, monkeypatch):
     asked = []
-    monkeypatch.setattr(generate, "bring_into_view", lambda *given: asked.append(given))
+    monkeypatch.setattr(generate, "frame_in_view", lambda: asked.append(len(humans(bpy.context.scene))))
     for seed in (7, 8):
         bpy.ops.primdiffusion.generate(seed=seed)
-    first, second = humans(addon.scene)
-    assert asked == [(first, generate.FIRST_HUMAN_SHARE), (second, 0.0)]
+    assert asked == [1]
 
 
 @pytest.mark.any_blender

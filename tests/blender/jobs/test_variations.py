@@ -26,10 +26,6 @@ def more_like(**given):
     return ops.variations(like=True, **given)
 
 
-def use_seed(**given):
-    return ops.variations(use_seed=True, **given)
-
-
 def select(*indices: int) -> None:
     manager = bpy.context.window_manager
     manager.primdiffusion_selected = [i in indices for i in range(len(manager.primdiffusion_selected))]
@@ -71,17 +67,12 @@ def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(add
     first = seeds()
     asked = sent(sheet.variations[0].person)
     assert (asked["steps"], asked["sampler"], asked["size"]) == (60, "ddim", 256)
-    settings.quality, settings.count = "DRAFT", "8"
+    addon.scene.primdiffusion.quality, settings.count = "DRAFT", "8"
     ops.variations()
     assert len(set(seeds())) == 8
     assert set(first).isdisjoint(seeds())
     asked = sent(sheet.variations[0].person)
     assert (asked["steps"], asked["sampler"]) == (8, "dpmpp_2m")
-    settings.seeds, settings.quality, settings.count = "CONSECUTIVE", "PANEL", "4"
-    addon.scene.primdiffusion.sampler = "ddpm"
-    ops.variations()
-    assert seeds() == [10, 11, 12, 13]
-    assert sent(sheet.variations[0].person)["sampler"] == "ddpm"
 
 
 def test_the_one_that_is_built_is_the_very_one_seen_and_one_undo_takes_them_away(addon, shown_people):
@@ -101,32 +92,26 @@ def test_the_one_that_is_built_is_the_very_one_seen_and_one_undo_takes_them_away
     assert not humans(bpy.context.scene)
 
 
-def test_build_all_builds_all_in_edit_mode_too(addon, shown_people):
+def test_whom_files_are_missing_of_is_not_built_and_those_before_stay_in_edit_mode_too(addon, shown_people):
     bpy.ops.object.armature_add()
     bpy.ops.object.mode_set(mode="EDIT")
-    assert ops.build_variation(build_all=True) == {"FINISHED"}
-    assert len(humans(addon.scene)) == 4
-
-
-def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, shown_people):
     sheet.variations[1].person.unlink()
+    select(0, 1, 2, 3)
     with refused(RuntimeError, "1 of 4"):
-        ops.build_variation(build_all=True)
+        ops.build_variation()
     assert len(humans(addon.scene)) == 1
 
 
 def test_nothing_selected_and_no_sheet_are_rejected(addon):
     assert not ops.build_variation.poll()
-    for call in (more_like, use_seed):
-        with refused(RuntimeError, "Show Variations"):
-            call()
+    with refused(RuntimeError, "Show Variations"):
+        more_like()
     ops.variations(seed=11)
     with refused(RuntimeError, "variation"):
         ops.build_variation()
     select(0, 1)
-    for call in (more_like, use_seed):
-        with refused(RuntimeError, "2 variations"):
-            call()
+    with refused(RuntimeError, "2 variations"):
+        more_like()
     with refused(RuntimeError, "8 seeds", "2147483647"):
         ops.variations(seed=2**31 - 1)
 
@@ -140,15 +125,6 @@ def test_more_like_this_requests_variants_of_the_chosen_human(addon, shown_peopl
     assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
     assert seeds() == [20, 21, 22, 23]
     assert sheet.title == "Like seed 12"
-    with refused(RuntimeError, "generated"):
-        select(0)
-        use_seed()
-
-
-def test_a_seed_is_put_into_the_panel_and_locked(addon, shown_people):
-    select(3)
-    use_seed()
-    assert (addon.scene.primdiffusion.seed, addon.scene.primdiffusion.keep_seed) == (14, True)
 
 
 def test_a_failure_leaves_the_sheet_that_was_there(addon, shown_people):
@@ -183,7 +159,7 @@ def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addo
     assert layout.of("prop").count("primdiffusion_selected") == 4
     texts = layout.of("text", "button")
     assert {"primdiffusion.build_variation", "New humans: 4"} <= set(texts)
-    assert texts.count("primdiffusion.variations") == 4, "show, clear, more like this, use seed"
+    assert texts.count("primdiffusion.variations") == 2, "show, more like this"
 
 
 def test_a_click_on_a_seed_selects_and_deselects_it(shown_people):
@@ -203,13 +179,11 @@ def test_as_many_pictures_stand_side_by_side_as_fit(width, columns):
     assert number * units * 20 <= max(width, 100)
 
 
-@pytest.mark.parametrize("end", ["clear", "load", "unregister"])
-def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_extension_ends(shown_people, end):
+@pytest.mark.parametrize("end", ["load", "unregister"])
+def test_files_and_pictures_go_when_another_file_is_loaded_or_the_extension_ends(shown_people, end):
     icons.of(sheet.variations[0].picture)
     assert files_left()
-    if end == "clear":
-        ops.variations(clear=True)
-    elif end == "load":
+    if end == "load":
         bpy.ops.wm.read_homefile(use_empty=True)
     else:
         import blender_primdiffusion
@@ -223,7 +197,7 @@ def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_
 
 def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
     queue.add(addon, VariationsJob((1,), {"steps": 1}, person=str(sheet.variations[0].person)))
-    ops.variations(clear=True)
+    sheet.clear()
     drive()
     assert "the human to vary was cleared" in error_of("variations").lower()
 

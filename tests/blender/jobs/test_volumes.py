@@ -1,18 +1,14 @@
 """Volumes are written when they are to be seen: by a job for views, before renders by another engine."""
 
-import math
-
 import bpy
 import pytest
 import synthetic_shape
 from human_files import copy_of, folder_of, forget_session_files
 from jobs_driven import error_of, notice_of
-from mathutils import Matrix, Vector
 
 import blender_primdiffusion
 from benchmarks.cycles_preview import setup_cycles_preview
 from blender_primdiffusion.engine.engine import ENGINE
-from blender_primdiffusion.jobs.generate import share_of_height
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.volumes import VolumesJob, faults, write_before_rendering
 from blender_primdiffusion.scene import volumes
@@ -199,50 +195,3 @@ def test_volumes_that_renders_hide_are_not_written_and_those_of_other_scenes_are
     bpy.ops.scene.new(type="EMPTY")
     write_before_rendering(bpy.context.scene)  # it may hold an instance of the human
     assert are_written(person)
-
-
-FOCAL = 2.0
-"""In half heights of the view, which spans as many metres as it is away."""
-
-
-def perspective(eye: Vector) -> Matrix:
-    """Of a square view from `eye` along -z."""
-    near, far = 0.1, 100.0
-    window = Matrix(
-        (
-            (FOCAL, 0, 0, 0),
-            (0, FOCAL, 0, 0),
-            (0, 0, (near + far) / (near - far), 2 * near * far / (near - far)),
-            (0, 0, -1, 0),
-        )
-    )
-    return window @ Matrix.Translation(-eye)
-
-
-@pytest.fixture
-def cube(empty_scene) -> bpy.types.Object:
-    """One metre wide, around the origin."""
-    bpy.ops.mesh.primitive_cube_add(size=1)
-    bpy.context.view_layer.update()
-    return bpy.context.object
-
-
-@pytest.mark.any_blender
-def test_the_share_of_height_is_that_of_the_bounding_box(cube):
-    assert share_of_height(perspective(Vector((0, 0, 4.5))), cube) == pytest.approx(0.25)  # the nearer face
-    assert share_of_height(perspective(Vector((0, 0, 40.5))), cube) == pytest.approx(0.025)
-    cube.scale = (1, 0.5, 1)
-    bpy.context.view_layer.update()
-    assert share_of_height(perspective(Vector((0, 0, 4.5))), cube) == pytest.approx(0.125)
-
-
-@pytest.mark.any_blender
-@pytest.mark.parametrize("eye", [(0, 0, -4), (0, 0, 0.2), (30, 0, 4.5), (0, -30, 4.5)], ids=str)
-def test_an_object_behind_beside_and_around_the_eye_is_not_shown(cube, eye):
-    assert share_of_height(perspective(Vector(eye)), cube) == 0
-
-
-@pytest.mark.any_blender
-def test_parallel_views_are_measured_too(cube):
-    window = Matrix.Diagonal((1 / 2, 1 / 2, -0.01, 1)) @ Matrix.Rotation(math.radians(90), 4, "X")
-    assert share_of_height(window, cube) == pytest.approx(0.25)

@@ -43,8 +43,8 @@ OF_SCANS = {"primdiffusion_part"}
 OF_FILES = ("capture/scan_files.py", "primdiffusion")
 """A key in a file that captures read."""
 OPERATORS_OWN = {
-    "scene/blend_values.py", "ui/export_operators.py",
-    "ui/import_motion.py", "ui/picture_panel.py",
+    "scene/blend_values.py", "ui/export_panel.py",
+    "ui/motion_panel.py", "ui/picture_panel.py",
     "ui/setup.py",
 }  # fmt: skip
 """Modules that resolve paths: besides the reader, those whose operators are given one by the user or a script."""

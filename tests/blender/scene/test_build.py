@@ -55,7 +55,7 @@ def test_volumes_follow_the_skin_to_a_hundredth_of_a_millimetre(person, seed):
 def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
     arrays = synthetic.arrays(1024)
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 1024))
-    assert len(parts_of(collection)) == 4
+    assert len(parts_of(collection)) == 3
     assert len(evaluated_matrices(collection)) == len(list(folder_of(collection).glob("prim_*.vdb"))) == 1024
     frames = np.arange(1, 9)
     swing = np.zeros((8, 24, 3))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.files.regular_files import FileError
-from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from human_files import sequence_files, volume_path
 from support.errors import refused
 
@@ -32,7 +31,7 @@ from blender_primdiffusion.scene.representation import (
     show_in_viewport,
     stop_showing,
 )
-from blender_primdiffusion.scene.volume_nodes import density_gain, volume_material, write_volumes
+from blender_primdiffusion.scene.volume_nodes import volume_material, write_volumes
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
@@ -174,14 +173,6 @@ def test_a_grid_is_read_as_the_child_wrote_it(tmp_path):
     read = read_grid(tmp_path / "grid.npz")
     np.testing.assert_array_equal(read.density, merged.density)
     assert read.voxel == 0.02
-
-
-def test_the_gain_is_the_one_of_the_material_where_it_still_has_the_node(empty_scene):
-    assert density_gain() is None
-    material = volume_material()
-    assert density_gain().default_value == pytest.approx(DENSITY_GAIN)
-    material.node_tree.nodes.remove(material.node_tree.nodes["Density Gain"])
-    assert density_gain() is None
 
 
 @pytest.mark.any_blender

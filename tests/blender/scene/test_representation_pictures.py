@@ -76,4 +76,4 @@ def test_the_engine_draws_the_person_alone_in_every_mode(person, tmp_path, mode)
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
     assert [one.params() for one in posed_humans(graph)] == [expected]
-    assert len(scene_solids(graph, False).corners) == 0
+    assert len(scene_solids(graph).corners) == 0

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.capture_layout import picture_path
+from blender_primdiffusion.formats.capture_repair import verify
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from capture_person import _few_faces, chequers, files_of
 from support.errors import refused
@@ -23,9 +24,8 @@ from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.jobs.follow import Session
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui import captures_settings
-from blender_primdiffusion.ui.captures_panel import RIG
-from blender_primdiffusion.ui.captures_settings import captures, command_args
+from blender_primdiffusion.ui import captures_panel
+from blender_primdiffusion.ui.captures_panel import captures, command_args
 
 pytestmark = pytest.mark.any_blender
 
@@ -111,29 +111,28 @@ def follow(until=lambda: False, seconds: float = 300) -> None:
 def render(people, out, options: str = SMALL) -> set[str]:
     """Press Render Captures with these folders in the panel."""
     settings = bpy.context.scene.primdiffusion_captures
-    settings.people, settings.out = str(people), str(out)
-    return bpy.ops.primdiffusion.render_captures(options=options)
+    settings.people, settings.out, settings.options = str(people), str(out), options
+    return bpy.ops.primdiffusion.render_captures()
 
 
 def start(settings, tmp_path) -> None:
     """As the operator with a window."""
     folder = tmp_path / "temporary"
     folder.mkdir()
-    captures.start(captures_settings.capturing(command_args(settings, bpy.context, folder), folder))
+    captures.start(captures_panel.capturing(command_args(settings, bpy.context, folder), folder))
 
 
 def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
     before = {(block.id_type, block.name) for block in data_blocks()}
-    out, verify = tmp_path / "captures", bpy.ops.primdiffusion.verify_captures
+    out = tmp_path / "captures"
     assert render(only_good, out) == {"FINISHED"}
     assert {(block.id_type, block.name) for block in data_blocks()} == before
     assert (out / "release_human_list.txt").read_text() == "anna\n"
     assert json.loads((out / "dataset.json").read_text())["frames"] == 2
-    assert verify() == {"FINISHED"}
+    assert verify(out) == {}
     picture_path(out / "anna", "depth", 1, 1).unlink()
-    with refused(RuntimeError, "1 problems", "0001.png"):
-        verify()
-    assert verify(repair=True) == {"FINISHED"}
+    assert render(only_good, out) == {"FINISHED"}
+    assert verify(out) == {}
 
 
 def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
@@ -163,15 +162,10 @@ def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(comman
     code, stdout, _ = command("--people", people, "--out", out, *SMALL.split(), "--only", "person_000000")
     assert code == DONE
     assert "1 were there" in stdout
-    code, stdout, _ = command("--out", out, "--verify")
-    assert code == DONE, stdout  # nothing of the broken scan has come into the dataset
+    assert verify(out) == {}, "nothing of the broken scan has come into the dataset"
     picture = picture_path(out / "person_000000", "img", 0, 0)
     whole = picture.read_bytes()
     picture.write_bytes(whole[: len(whole) // 2])
-    code, stdout, _ = command("--out", out, "--verify", "--repair")
-    assert code == FAILED
-    assert str(picture) in stdout
-    assert not picture.exists()
     command("--people", people, "--out", out, *SMALL.split(), "--only", "person_000000")
     assert picture.read_bytes() == whole
 
@@ -229,9 +223,9 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
 )  # fmt: skip
 def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, tmp_path, message, fault):
     program = f"import time; print({MARK + message!r}, flush=True); time.sleep(600)"
-    monkeypatch.setattr(captures_settings, "child_command", lambda: [sys.executable, "-c", program])
+    monkeypatch.setattr(captures_panel, "child_command", lambda: [sys.executable, "-c", program])
     session = Session("", "")
-    session.start(captures_settings.capturing([], tmp_path / "folder"))
+    session.start(captures_panel.capturing([], tmp_path / "folder"))
     end = time.monotonic() + 300
     while session.busy and time.monotonic() < end:
         session.tick()
@@ -317,22 +311,6 @@ def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
     assert [view.position.round(4).tolist() for view in settings.cameras] == [[2, 0.5, 4], [1, 0.5, 4]]
     assert settings.camera_count == 2
     assert (settings.cameras[0].width, settings.cameras[0].height) == (80, 60)
-
-
-def test_the_preview_shows_the_rig_and_goes_again(extension):
-    asked = extension.scene.primdiffusion_captures
-    asked.arrangement, asked.camera_count = "sphere", 7
-    before = {(block.id_type, block.name) for block in data_blocks()}
-    assert bpy.ops.primdiffusion.preview_rig() == {"FINISHED"}
-    shown = bpy.data.collections[RIG]
-    assert len(shown.objects) == 7
-    bpy.context.view_layer.update()
-    for camera in shown.objects:  # each looks at the middle
-        forward = np.array(camera.matrix_world)[:3, :3] @ (0, 0, -1)
-        position = np.array(camera.matrix_world.translation)
-        assert np.allclose(forward, -position / np.linalg.norm(position), atol=1e-5)
-    assert bpy.ops.primdiffusion.preview_rig() == {"FINISHED"}
-    assert {(block.id_type, block.name) for block in data_blocks()} == before
 
 
 def test_hostile_camera_files_are_rejected(tmp_path):

@@ -13,9 +13,8 @@ LARGEST = 2**31 - 1
 SETTINGS = {
     "primdiffusion": (requests.GenerateRequest, ("steps", "guidance", "seed")),
     "primdiffusion_edit": (requests.VaryRequest, ("amount", "seed")),
-    "primdiffusion_reconstruct": (requests.ReconstructRequest, ("frame", "views")),
     "primdiffusion_export": (requests.ProxyRequest, ("triangles",)),
-    "primdiffusion_captures": (CaptureSettings, ("together", "pose_count", "samples", "seed")),
+    "primdiffusion_captures": (CaptureSettings, ("pose_count", "samples", "seed")),
 }
 
 

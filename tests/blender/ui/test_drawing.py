@@ -20,8 +20,7 @@ from blender_primdiffusion.jobs.variations import Variation, sheet
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human_file import shape_model_of
-from blender_primdiffusion.ui import drawing, generate_panel
-from blender_primdiffusion.ui.captures_settings import captures
+from blender_primdiffusion.ui import generate_panel
 
 pytestmark = pytest.mark.any_blender
 SMALL_WINDOW_PX = 620
@@ -41,19 +40,13 @@ def human(addon, tmp_path, monkeypatch):
     return human
 
 
-def test_numbers_keep_their_units_where_lines_break():
-    lines = drawing._wrapped("Generated in 47.6 s, and after that built in 2.9 s.")
-    assert not any(line.startswith(("s,", "s.")) for line in lines)
-    assert " ".join(lines) == "Generated in 47.6 s, and after that built in 2.9 s."
-    assert max(map(len, lines)) <= drawing._LINE
-
-
-def test_there_is_one_tab_and_one_for_captures_where_the_preferences_ask_for_it(human):
-    assert list(sidebar.tabs(bpy.context)) == ["PrimDiffusion"]
+def test_captures_are_shown_where_the_preferences_ask_for_them(human):
+    captures = bpy.types.PRIMDIFFUSION_PT_captures
     with in_preferences():
-        assert list(sidebar.tabs(bpy.context)) == ["PrimDiffusion"]
+        assert not captures.poll(bpy.context)
         bpy.context.preferences.addons["blender_primdiffusion"].preferences.captures = True
-        assert list(sidebar.tabs(bpy.context)) == ["PrimDiffusion", "PrimDiffusion Data"]
+        assert captures.poll(bpy.context)
+    assert list(sidebar.tabs(bpy.context)) == ["PrimDiffusion"]
 
 
 def test_panels_and_operators_are_few(human):
@@ -110,7 +103,7 @@ def drawn() -> Iterator[tuple[type, sidebar.Layout]]:
             yield cls, sidebar.draw(cls, bpy.context, opened=True)
 
 
-@pytest.mark.parametrize("situation", ["no backend", "one human", "variations", "all variations", "captures"])
+@pytest.mark.parametrize("situation", ["no backend", "one human", "variations", "all variations"])
 def test_no_button_is_grey_without_a_reason_in_the_panel(human, monkeypatch, tmp_path, situation):
     if situation == "no backend":
         monkeypatch.setattr(generate_panel, "draw_set_up", lambda _layout: False)
@@ -118,8 +111,6 @@ def test_no_button_is_grey_without_a_reason_in_the_panel(human, monkeypatch, tmp
         monkeypatch.setattr("blender_primdiffusion.ui.variations_panel._draw_picture", lambda *_: None)
         chosen = situation == "all variations"
         monkeypatch.setattr(sheet, "variations", [Variation(seed, tmp_path, chosen) for seed in range(3)])
-    if situation == "captures":
-        monkeypatch.setattr(type(captures), "busy", True)
     grey = set()
     for cls, layout in drawn():
         for button in layout.buttons:
@@ -132,7 +123,6 @@ def test_no_button_is_grey_without_a_reason_in_the_panel(human, monkeypatch, tmp
         "one human": set(),
         "variations": {"build_variation", "variations"},
         "all variations": {"variations"},
-        "captures": {"preview_rig", "verify_captures"},
     }
     assert grey == always | more[situation]
 

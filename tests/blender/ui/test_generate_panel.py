@@ -1,9 +1,8 @@
-"""The panel Generate: seeds, counts, quality, presets, and people who stand side by side."""
+"""The panel Generate: seeds, counts, quality, and people who stand side by side."""
 
 import itertools
 import random
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -34,14 +33,6 @@ def queued_jobs(monkeypatch):
     monkeypatch.setattr(
         generate_panel, "submit", lambda _operator, context, job: queue.add(context, job) and {"FINISHED"}
     )
-
-
-@pytest.fixture
-def presets_folder(tmp_path, monkeypatch):
-    folder = Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{generate_panel.SUBDIR}", create=True))
-    for path in folder.glob("*.py"):
-        path.unlink()
-    return folder
 
 
 def seeds(context) -> list[int]:
@@ -132,22 +123,6 @@ def test_a_quality_stands_for_steps_and_sampler_and_these_name_the_quality(panel
     assert (panel_settings.quality, panel_settings.steps) == ("CUSTOM", 30)
 
 
-def test_a_preset_holds_everything_but_the_seed(panel_settings, presets_folder):
-    panel_settings.quality, panel_settings.guidance, panel_settings.seed = "HIGH", 2.5, 5
-    panel_settings.attributes.use_height, panel_settings.attributes.height = True, 1.9
-    assert bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones") == {"FINISHED"}
-    (path,) = presets_folder.glob("*.py")
-    assert "seed" not in path.read_text()
-    panel_settings.quality, panel_settings.guidance, panel_settings.seed = "DRAFT", 1.0, 6
-    panel_settings.attributes.use_height = False
-    menu = generate_panel.PRIMDIFFUSION_PT_generate_presets.__name__
-    assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname=menu) == {"FINISHED"}
-    assert (panel_settings.quality, panel_settings.guidance, panel_settings.seed) == ("HIGH", 2.5, 6)
-    assert panel_settings.attributes.use_height
-    bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones", remove_name=True)
-    assert not list(presets_folder.glob("*.py"))
-
-
 def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_of_the_backend(
     addon, panel_settings, monkeypatch
 ):
@@ -166,25 +141,22 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
 
 
 @pytest.mark.parametrize(
-    ("engine", "camera", "button"),
+    ("engine", "button"),
     [
-        ("PRIMDIFFUSION", True, "render.render"),
-        ("CYCLES", True, "render.render"),
-        ("PRIMDIFFUSION", False, "primdiffusion.add_camera"),
-        ("BLENDER_WORKBENCH", True, "primdiffusion.set_up_engine"),
+        ("PRIMDIFFUSION", "render.render"),
+        ("CYCLES", "render.render"),
+        ("BLENDER_WORKBENCH", "primdiffusion.set_up_engine"),
     ],
 )
-def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as_mesh(addon, engine, camera, button):
+def test_after_success_the_panel_has_one_line_and_the_button_of_the_next_step(addon, engine, button):
     scene, panel = addon.scene, generate_panel.PRIMDIFFUSION_PT_generate
     scene.render.engine = engine
-    if camera:
-        scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     before = shown(panel, addon)
     bpy.ops.primdiffusion.generate(seed=7)
-    line, next_step, as_mesh = (text for text in shown(panel, addon) if text not in before)
+    line, next_step = (text for text in shown(panel, addon) if text not in before)
     assert re.fullmatch(r"Generated in [0-9.]+ s\.", line)
     assert next_step == button
-    assert as_mesh == "primdiffusion.add_proxy"
 
 
 def test_the_next_step_waits_until_no_job_is_running(addon):

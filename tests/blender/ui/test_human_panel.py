@@ -22,7 +22,7 @@ from blender_primdiffusion.scene.handles import has_handles
 from blender_primdiffusion.scene.human import BETAS, MARK, body_of, humans
 from blender_primdiffusion.scene.human_file import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
-from blender_primdiffusion.ui import pose_panel
+from blender_primdiffusion.ui import human_panel
 from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (
@@ -86,8 +86,6 @@ def test_impossible_heights_leave_the_human_unchanged(person, capsys):
     settings(person).height = 2.9
     assert surface(person) == before
     assert "no body of this model has a height of 2.90 m" in capsys.readouterr().out
-    with refused(RuntimeError, "2.90"):
-        ops.reshape(height=2.9)
 
 
 def test_one_undo_takes_a_slider_back_and_redo_brings_it_again(person):
@@ -154,38 +152,7 @@ def test_each_press_of_random_is_another_body(person, addon):
     assert pressed[0].seed != pressed[1].seed
 
 
-def test_a_shape_is_copied_from_the_other_person(person, other):
-    reshape(other, np.array(TALL))
-    bpy.context.scene.primdiffusion_edit.other = other
-    assert ops.reshape(to="OTHER", human="Human") == {"FINISHED"}
-    np.testing.assert_allclose(betas_of(person), TALL)
-    bpy.context.scene.primdiffusion_edit.other = person
-    reshape(person, np.zeros(10))
-    assert ops.reshape(to="OTHER", human="Ötzi") == {"FINISHED"}
-    assert not betas_of(other).any()
-
-
-@pytest.mark.parametrize(
-    ("other", "sentence"),
-    [(None, "choose the other human"), ("Human", "cannot be the other"), ("Eve", "not in the")],
-)
-def test_copying_without_another_human_is_rejected(person, other, sentence):
-    bpy.data.objects.new("Eve", None)
-    bpy.context.scene.primdiffusion_edit.other = bpy.data.objects.get(other or "")
-    with pytest.raises(RuntimeError, match=sentence):
-        ops.reshape(to="OTHER")
-
-
-def test_a_script_gives_betas_and_measures(person):
-    ops.reshape(betas=TALL)
-    np.testing.assert_allclose(betas_of(person), TALL)
-    ops.reshape(height=1.7)
-    assert height(person) == pytest.approx(1.7, abs=2e-4)
-    with refused(RuntimeError, "-5 to 5"):
-        ops.reshape(betas=[9.0] * 10)
-
-
-def test_the_panels_show_height_and_provenance(person, addon):
+def test_the_panel_shows_provenance(person, addon):
     person[MARK] = json.dumps(
         {
             **json.loads(person[MARK]),
@@ -194,22 +161,10 @@ def test_the_panels_show_height_and_provenance(person, addon):
             "unfollowed": {"hair": "long"},
         }
     )
-    addon.scene.unit_settings.system = "IMPERIAL"
-    panel = " ".join(shown(draw_shape, addon))
-    assert "In the scene: " in panel
-    assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
     for text in made:
         assert text in details
-
-
-def test_a_scaled_human_shows_its_height_in_the_scene(person, addon):
-    assert "In the scene" not in " ".join(shown(draw_shape, addon))
-    person.scale = (2, 2, 2)
-    addon.view_layer.update()
-    tall = 2 * measure(shape_model_of(person), betas_of(person)).height
-    assert f"In the scene: {f'{tall:.2f}'.rstrip('0')} m" in " ".join(shown(draw_shape, addon))
 
 
 def test_other_bodies_have_sliders_with_numbers(person):
@@ -259,18 +214,18 @@ def test_the_panel_leads_to_the_asset_shelf_of_pose_mode(addon, armature):
         ("show_region_asset_shelf", "object.posemode_toggle"),
     ):
         layout = Layout()
-        pose_panel.draw_pose(layout, addon)
+        human_panel.draw_pose(layout, addon)
         assert button in layout.of("button", "prop")
         assert other not in layout.of("button", "prop")
         bpy.ops.object.posemode_toggle()
 
 
 def test_the_panel_offers_to_add_handles_or_else_to_bake_them(addon, armature):
-    drawn = set(shown(pose_panel.draw_pose, addon))
+    drawn = set(shown(human_panel.draw_pose, addon))
     assert "primdiffusion.add_handles" in drawn
     assert "primdiffusion.bake_handles" not in drawn
     assert ops.add_handles() == {"FINISHED"}
-    drawn = set(shown(pose_panel.draw_pose, addon))
+    drawn = set(shown(human_panel.draw_pose, addon))
     assert "primdiffusion.bake_handles" in drawn
     assert "primdiffusion.add_handles" not in drawn
     assert ops.bake_handles() == {"FINISHED"}

@@ -1,4 +1,4 @@
-"""Import Motion: timing, root, bones, what is rejected, and what the file browser shows."""
+"""Import Motion: rate, range, root, and what is rejected."""
 
 import json
 import pickle
@@ -9,12 +9,8 @@ import numpy as np
 import pytest
 import synthetic
 from amass_files import feet, write_amass
-from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.rotation import about_axis
-from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
-from bvh_files import motion_of, write_bvh
-from jobs_driven import Layout
 from support.errors import refused
 
 from blender_primdiffusion.motion.poses import current_pose
@@ -22,7 +18,7 @@ from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.import_motion import PRIMDIFFUSION_OT_import_motion, look_at, nearest_to
+from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_OT_import_motion
 
 pytestmark = pytest.mark.any_blender
 
@@ -49,26 +45,24 @@ def test_amass_comes_in_at_the_scenes_rate_on_the_floor_from_where_the_person_is
     assert addon.scene.frame_end >= 34
 
 
-def test_every_source_frame_can_be_kept_and_the_rate_corrected(addon, armature, tmp_path):
+def test_the_rate_can_be_corrected(addon, armature, tmp_path):
     addon.scene.render.fps = 24
-    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", fps=48.0, start=1)
-    keys = action_curves(armature)[0].keyframe_points
-    assert len(keys) == 31
-    assert keys[1].co[0] == pytest.approx(1.5)
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), fps=48.0, start=1)
+    assert len(action_curves(armature)[0].keyframe_points) == 16
 
 
-def test_part_of_a_file_and_every_second_frame(addon, armature, tmp_path):
-    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", first=11, last=20, stride=3)
-    assert len(action_curves(armature)[0].keyframe_points) == 4
+def test_part_of_a_file(addon, armature, tmp_path):
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), fps=24.0, first=11, last=20)
+    assert len(action_curves(armature)[0].keyframe_points) == 10
     with refused(RuntimeError, "40 to 31"):
         ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), first=40)
 
 
-def test_root_motion_can_be_kept_or_left_out_and_scaled(addon, armature, tmp_path):
+def test_root_motion_can_be_kept_or_left_out(addon, armature, tmp_path):
     path = write_amass(tmp_path / "m.npz")
-    ops.import_motion(filepath=path, root="KEEP", ground=False, scale=2.0, start=1)
+    ops.import_motion(filepath=path, root="KEEP", ground=False, fit_stride=False, start=1)
     addon.scene.frame_set(1)
-    np.testing.assert_allclose(current_pose(armature)[1], 2 * read_motion(path).translations[0], atol=1e-4)
+    np.testing.assert_allclose(current_pose(armature)[1], read_motion(path).translations[0], atol=1e-4)
     ops.import_motion(filepath=path, root="PLACE")
     for frame in (1, 4):
         addon.scene.frame_set(frame)
@@ -120,23 +114,6 @@ def test_of_two_people_the_named_one_moves(addon, armature, tmp_path):
         ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), human="Eve")
 
 
-def test_bones_can_be_chosen_for_an_unknown_rig(addon, armature, tmp_path):
-    names = {name: f"b{number}" for number, name in enumerate(JOINT_NAMES)}
-    rotations, moves = motion_of(0.2)
-    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, REST_JOINTS[0] + moves, names, frame_time="0.0416667")
-    with refused(RuntimeError, "bone"):
-        ops.import_motion(filepath=str(path))
-    assert "b3" in look_at(str(path)).bones
-    chosen = {f"bone_{joint}": bone for joint, bone in names.items()}
-    ops.import_motion(filepath=str(path), bones="CHOSEN", start=1, timing="SOURCE", **chosen)
-    addon.scene.frame_set(3)
-    np.testing.assert_allclose(current_pose(armature)[0][16], rotations[2, 16], atol=1e-3)
-    with refused(RuntimeError, "nose"):
-        ops.import_motion(filepath=str(path), bones="CHOSEN", **{**chosen, "bone_head": "nose"})
-    with refused(RuntimeError, "left_knee"):
-        ops.import_motion(filepath=str(path), bones="CHOSEN", **{**chosen, "bone_left_knee": ""})
-
-
 def test_one_undo_takes_an_imported_motion_back(addon, armature, tmp_path):
     assert "UNDO" in PRIMDIFFUSION_OT_import_motion.bl_options
     bpy.ops.ed.undo_push(message="before")
@@ -149,32 +126,14 @@ def test_one_undo_takes_an_imported_motion_back(addon, armature, tmp_path):
 def test_a_scaled_armature_and_other_units_change_nothing_in_its_own_space(addon, armature, tmp_path):
     addon.scene.unit_settings.scale_length = 0.01
     armature.scale = (2, 2, 2)
-    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", fps=24.0, start=1)
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), fps=24.0, start=1)
     addon.scene.frame_set(31)
     assert current_pose(armature)[1][0] == pytest.approx(1.0, abs=1e-4)
-
-
-def test_every_one_of_fifteen_hundred_frames_is_keyed(addon, armature, tmp_path):
-    path = write_amass(tmp_path / "long.npz", frames=1500)
-    ops.import_motion(filepath=path, timing="SOURCE")
-    assert {len(curve.keyframe_points) for curve in action_curves(armature)} == {1500}
-    assert len(action_curves(armature)) == 24 * 4 + 3
 
 
 def test_facts_are_stored_with_the_action(addon, armature, tmp_path):
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
     assert json.loads(armature.animation_data.action["primdiffusion_motion"])["Frame Rate"] == "120"
-
-
-def test_the_person_under_the_mouse_is_whose_joints_surround_it():
-    seen = {
-        "Ann": np.array([[100, 100], [140, 300]]),
-        "Bob": np.array([[130, 100], [170, 300]]),
-        "Behind": np.zeros((0, 2)),
-    }
-    assert nearest_to((102, 110), seen) == "Ann"
-    assert nearest_to((168, 280), seen) == "Bob"
-    assert nearest_to((600, 110), seen) == ""
 
 
 def test_files_are_dropped_onto_the_import(addon):
@@ -185,42 +144,20 @@ def test_files_are_dropped_onto_the_import(addon):
     assert not handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="IMAGE_EDITOR")))
 
 
-def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
-    def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
-        values = {"filepath": path, "human": "", "into": "NEW", "bones": "AUTO", **settings}
-        operator = SimpleNamespace(layout=Layout(), axis=lambda: "", tracked_person="", **values)
-        operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
-        PRIMDIFFUSION_OT_import_motion.draw(operator, addon)
-        return operator.layout.of("text"), operator.layout.of("prop")
-
-    labels, settings = drawn(write_amass(tmp_path / "m.npz"))
-    assert {"Ann", "SMPL-H", "120", "z"} <= set(labels)
-    assert "bones" not in settings
-    (tmp_path / "bad.bvh").write_text("HIERARCHY")
-    assert "choose a BVH file" in " ".join(drawn(str(tmp_path / "bad.bvh"))[0])  # lines break where the path ends
-    assert drawn("")[0] == ["Ann"]
-    path = write_bvh(
-        tmp_path / "m.bvh", REST_JOINTS, *motion_of(), {name: f"x{i}" for i, name in enumerate(JOINT_NAMES)}
-    )
-    assert "bone_left_knee" in drawn(str(path), bones="CHOSEN")[1]
-
-
-def test_a_person_of_a_trackers_file_is_chosen_among_those_that_are_listed(addon, armature, tmp_path):
+def test_a_person_of_a_trackers_file_is_chosen_among_those_that_an_error_lists(addon, armature, tmp_path):
     path, theta = tmp_path / "wham_output.pkl", np.random.default_rng(2).normal(0, 0.2, (5, 72))
     path.write_bytes(pickle.dumps({0: {"pose_world": theta}, 4: {"pose_world": theta[:3] * 0.5}}))
-    look = look_at(str(path))
-    assert (look.people, look.facts["People"]) == (("0", "4"), "2: 0, 4")
-    ops.import_motion(filepath=str(path), tracked_person="4", timing="SOURCE")
+    ops.import_motion(filepath=str(path), tracked_person="4", fps=24.0)
     assert len(action_curves(armature)[0].keyframe_points) == 3
-    with refused(RuntimeError, "'9'"):
+    assert json.loads(armature.animation_data.action["primdiffusion_motion"])["People"] == "2: 0, 4"
+    with refused(RuntimeError, "'9'", "4 (3 frames)"):
         ops.import_motion(filepath=str(path), tracked_person="9")
 
 
-def test_who_never_stands_is_shown_as_doubtful_until_the_axis_is_set(addon, tmp_path):
+def test_a_motion_in_which_nobody_stands_is_called_doubtful_until_the_axis_is_set(addon, armature, tmp_path):
     theta = np.zeros((2, 24, 3))
     theta[:, 1:3, 0] = -2.0
     np.savez(tmp_path / "m.npz", poses=theta.reshape(2, 72), trans=np.zeros((2, 3)))
-    look = look_at(str(tmp_path / "m.npz"))
-    assert "stands in no frame" in look.error
-    assert look.facts["Up Axis"] == "y (uncertain)"
-    assert look_at(str(tmp_path / "m.npz"), "y").error == ""
+    for up, shown in (("AUTO", "y (uncertain)"), ("Y", "y")):
+        ops.import_motion(filepath=str(tmp_path / "m.npz"), up=up)
+        assert json.loads(armature.animation_data.action["primdiffusion_motion"])["Up Axis"] == shown

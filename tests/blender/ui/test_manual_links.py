@@ -1,4 +1,4 @@
-"""The manual: made of docs/manual for the zip, opened by panels and by F1, without a network."""
+"""The manual: made of docs/manual for the zip, opened by panels, without a network."""
 
 import re
 import sys
@@ -11,7 +11,7 @@ import pytest
 from support.errors import refused
 
 import build_manual
-from blender_primdiffusion.ui import drawing, manual
+from blender_primdiffusion.ui import drawing
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
 import sidebar
@@ -29,7 +29,7 @@ def opened(monkeypatch) -> list[str]:
 def button(page: str, anchor: str = "") -> list[str]:
     """Addresses that the question mark of a panel opens."""
     layout = MagicMock()
-    manual.draw_manual_button(layout, page, anchor)
+    drawing.draw_manual_button(layout, page, anchor)
     return [
         layout.operator.return_value.url for call in layout.operator.call_args_list if call.args == ("wm.url_open",)
     ]
@@ -48,12 +48,12 @@ def test_for_a_page_that_is_not_there_the_list_of_pages_is_shown(addon, page):
 
 
 def test_without_the_manual_there_is_no_button(addon, monkeypatch):
-    monkeypatch.setattr(manual, "page_file", lambda _page: None)
-    manual.page_url.cache_clear()
+    monkeypatch.setattr(drawing, "page_file", lambda _page: None)
+    drawing.page_url.cache_clear()
     try:
         assert button("batch") == []
     finally:
-        manual.page_url.cache_clear()
+        drawing.page_url.cache_clear()
 
 
 def test_every_panel_and_section_leads_to_a_heading_that_is_there(armature, monkeypatch):
@@ -67,26 +67,6 @@ def test_every_panel_and_section_leads_to_a_heading_that_is_there(armature, monk
         text = pages[f"{page}.html"].decode()
         assert not anchor or f'id="{anchor}"' in text, (page, anchor)
     assert len(asked) > 15
-
-
-@pytest.mark.parametrize(
-    ("doc_id", "section"),
-    [
-        ("primdiffusion.generate", "generate"),
-        ("PRIMDIFFUSION_OT_render_captures.people", "render_captures"),
-        ("PRIMDIFFUSION_PG_settings.seed", "primdiffusion_pg_settings"),
-    ],
-)
-def test_f1_on_what_is_ours_leads_to_its_section(addon, opened, doc_id, section):
-    assert bpy.ops.wm.doc_view_manual(doc_id=doc_id) == {"FINISHED"}
-    assert opened[0].endswith(f"/docs/manual/api.md#{section}")
-    assert f"### {section}" in manual.page_file("api").read_text().lower()
-
-
-def test_f1_on_blenders_own_types_is_left_to_blender(addon):
-    prefix, mapping = manual.manual_map()
-    assert prefix.startswith("file:///")
-    assert all("primdiffusion" in pattern for pattern, _ in mapping)
 
 
 def test_pages_have_tables_anchors_and_no_links_out_of_the_manual(tmp_path):

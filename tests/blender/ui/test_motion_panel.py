@@ -1,4 +1,4 @@
-"""Built-in motions, appending, strips, loops, export and the Motion panel, as the user meets them."""
+"""Built-in motions, export and the Motion panel, as the user meets them."""
 
 import bpy
 import numpy as np
@@ -9,62 +9,14 @@ from blender_primdiffusion.formats.poses.files import read_motion
 from jobs_driven import Layout
 
 from blender_primdiffusion.motion.poses import current_pose
-from blender_primdiffusion.scene.actions import action_curves, last_key, loops
+from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.ui.motion_panel import draw_motion
 
 ops = bpy.ops.primdiffusion
 
 
-def test_appending_continues_after_the_last_key_without_a_flip(addon, armature, tmp_path):
-    ops.add_motion(motion="WALK", rounds=1)
-    end, action = last_key(armature), armature.animation_data.action
-    ops.add_motion(motion="TURN", rounds=1, into="APPEND")
-    assert armature.animation_data.action == action
-    keys = action_curves(armature)[0].keyframe_points
-    times = [key.co[0] for key in keys]
-    assert times == sorted(set(times))
-    assert last_key(armature) > end + 40
-    values = np.array([[k.co[1] for k in c.keyframe_points] for c in list(action_curves(armature))[4:8]])
-    assert (values[:, 1:] * values[:, :-1]).sum(0).min() > 0
-
-
-@pytest.mark.any_blender
-def test_appending_to_nothing_is_rejected_and_leaves_nothing(addon, armature):
-    before = len(bpy.data.actions)
-    with pytest.raises(RuntimeError, match="no motion to append to"):
-        ops.add_motion(motion="WALK", into="APPEND")
-    assert len(bpy.data.actions) == before
-
-
-def test_a_strip_moves_the_person_as_the_action_did(addon, armature):
-    ops.add_motion(motion="WAVE", rounds=1)
-    addon.scene.frame_set(30)
-    wanted = np.array(armature.pose.bones["right_elbow"].matrix)
-    armature.animation_data_clear()
-    ops.add_motion(motion="WAVE", rounds=1, into="STRIP")
-    assert armature.animation_data.action is None
-    (track,) = armature.animation_data.nla_tracks
-    assert track.strips[0].action_slot is not None
-    addon.scene.frame_set(30)
-    np.testing.assert_allclose(np.array(armature.pose.bones["right_elbow"].matrix), wanted, atol=1e-5)
-
-
-def test_a_looped_walk_continues_from_where_it_has_got_to(addon, armature):
-    ops.add_motion(motion="WALK", rounds=1)
-    end = int(last_key(armature))
-    addon.scene.frame_set(end)
-    reached = current_pose(armature)[1][2]
-    armature.primdiffusion_human.loop = True
-    assert loops(armature)
-    addon.scene.frame_set(2 * end - 1)
-    assert current_pose(armature)[1][2] == pytest.approx(2 * reached, rel=1e-3)
-    armature.primdiffusion_human.loop = True
-    assert armature.primdiffusion_human.loop
-    armature.primdiffusion_human.loop = False
-    assert not loops(armature)
-    armature.animation_data_clear()
-    armature.primdiffusion_human.loop = True
-    assert not armature.primdiffusion_human.loop, "there is nothing to loop"
+def last_key(armature) -> float:
+    return max(curve.keyframe_points[-1].co[0] for curve in action_curves(armature))
 
 
 @pytest.mark.any_blender
@@ -145,6 +97,5 @@ def test_the_panel_shows_what_was_found(addon, armature, tmp_path):
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
     shown = texts(addon)
     assert {"SMPL-H", "z", "31 (0.3 s)", "120", "metres"} <= set(shown)
-    assert "loop" in shown
     armature.animation_data.action["primdiffusion_motion"] = "rubbish"
     assert "SMPL-H" not in texts(addon)

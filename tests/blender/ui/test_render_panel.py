@@ -19,7 +19,7 @@ from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import HumanTarget, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
-from blender_primdiffusion.scene.representation import representation_of, show_in_viewport
+from blender_primdiffusion.scene.representation import representation_of
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
 from blender_primdiffusion.ui import advanced_panel, preferences, render_panel
 
@@ -186,10 +186,6 @@ def test_panels_show_representations_and_warnings(person):
     ops.merge()
     assert advanced().count("set_representation") == 2 + SPLATS_AVAILABLE
     ops.merge(what="NOTHING")
-    context.scene.render.engine = "CYCLES"
-    assert "31 volumes" in advanced()
-    context.scene.render.engine = "PRIMDIFFUSION"
-    assert "31 volumes" not in advanced(), "of no interest to this engine"
     assert shown(render_panel.PRIMDIFFUSION_PT_render, context).count("primdiffusion.set_up_engine") == 2
 
 
@@ -215,37 +211,6 @@ def test_before_the_backend_is_set_up_cycles_alone_is_offered_and_nothing_is_mer
     assert shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context).count("primdiffusion.set_up_engine") == 1
     assert ops.set_up_engine(engine="CYCLES") == {"FINISHED"}
     assert merged_of(person) is None
-
-
-def test_the_panel_says_who_draws_humans(person):
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    show_in_viewport(person, False)
-    assert render_panel.how_shown(scene) == render_panel.UNLIT
-    show_in_viewport(person, True)
-    assert render_panel.how_shown(scene) == render_panel.APPROXIMATE
-    assert "with light and shadows" in " ".join(shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context))
-    show_in_viewport(person, False)
-    assert ops.set_up_engine() == {"FINISHED"}
-    assert render_panel.how_shown(scene) == render_panel.EXACT
-    scene.render.engine = "BLENDER_WORKBENCH"
-    assert render_panel.how_shown(scene) == render_panel.OTHER_ENGINE
-    scene.render.engine = "CYCLES"
-
-
-def test_a_camera_is_added_that_sees_the_whole_person(person):
-    from bpy_extras.object_utils import world_to_camera_view
-
-    assert ops.add_camera() == {"FINISHED"}
-    scene = bpy.context.scene
-    bpy.context.view_layer.update()
-    armature = person
-    for bone in armature.pose.bones:
-        x, y, depth = world_to_camera_view(scene, scene.camera, armature.matrix_world @ bone.head)
-        assert 0 < x < 1
-        assert 0 < y < 1
-        assert depth > 0
-    assert any(light.type == "SUN" for light in bpy.data.lights)
 
 
 @pytest.mark.any_blender

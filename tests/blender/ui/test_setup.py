@@ -10,13 +10,13 @@ import pytest
 from jobs_driven import Layout
 from support.errors import refused
 from support.fake_child import FAKE_CHILD
-from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
+from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages
 
 import blender_primdiffusion
 import build_addon
 from blender_primdiffusion import places
 from blender_primdiffusion.backend import setup
-from blender_primdiffusion.backend.environment import VARIABLE, state_of
+from blender_primdiffusion.backend.environment import VARIABLE
 from blender_primdiffusion.ui import preferences
 from blender_primdiffusion.ui import setup as ui_setup
 from blender_primdiffusion.ui.preferences import known
@@ -54,6 +54,13 @@ def online(wheels):
     return wheels
 
 
+@pytest.fixture
+def index(online, monkeypatch):
+    with served(online) as (address, _):
+        own_index(monkeypatch, address)
+        yield address
+
+
 def said(layout: Layout) -> str:
     return " ".join(layout.of("text"))
 
@@ -64,14 +71,14 @@ def draw_preferences() -> Layout:
     return layout
 
 
-def test_from_no_backend_to_a_backend(wheels):
+def test_from_no_backend_to_a_backend(index):
     layout = Layout()
     assert not preferences.draw_set_up(layout)
     assert "The backend is not set up yet" in said(layout)
     assert "Downloads" in said(layout)
     assert "primdiffusion.set_up_backend" in layout.of("button")
 
-    assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
+    assert press.set_up_backend() == {"FINISHED"}
     assert known().state == "ready"
     assert session.notice.startswith("The backend is ready: torch 0-tiny")
     layout = Layout()
@@ -85,13 +92,11 @@ def test_from_no_backend_to_a_backend(wheels):
     assert press.set_up_backend() == {"FINISHED"}  # nothing to do
 
 
-def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monkeypatch):
-    with served(online) as (index, _):
-        own_index(monkeypatch, index)
-        assert press.set_up_backend() == {"FINISHED"}
-        assert known().state == "ready"
-        next(places.set_up_folder().environment.rglob("tiny.py")).unlink()
-        assert press.set_up_backend(repair=True) == {"FINISHED"}
+def test_repair_installs_again_what_is_damaged(index):
+    assert press.set_up_backend() == {"FINISHED"}
+    assert known().state == "ready"
+    next(places.set_up_folder().environment.rglob("tiny.py")).unlink()
+    assert press.set_up_backend(repair=True) == {"FINISHED"}
     assert known().state == "ready"
     assert list(places.set_up_folder().environment.rglob("tiny.py"))
 
@@ -117,24 +122,15 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
     assert "wm.path_open" in draw_preferences().of("button")
 
 
-def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
-    ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
-    monkeypatch.setattr(ui_setup, "available", lambda: {"cpu": ours})
-    with refused(RuntimeError, "differs"):
-        press.set_up_backend(choose=True, directory=str(wheels))
-    write_lock(wheels / ui_setup.OWN_LOCK, sorted(wheels.glob("*.whl")))
-    assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
-    assert state_of(places.set_up_folder())[1]["lock_name"] == "requirements.txt"
-
-
-def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
-    assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
+def test_an_environment_with_outdated_packages_is_reported(index, monkeypatch):
+    assert press.set_up_backend() == {"FINISHED"}
     (path,) = ui_setup.available().values()
     monkeypatch.setattr(ui_setup, "LOCKS", path.parent)
     path.write_text(path.read_text() + "# another\n")
     ui_setup.read_once.cache_clear()
     assert known().state == "outdated"
     assert "press Repair" in known().line
+    bpy.context.preferences.system.use_online_access = False
     with refused(RuntimeError, "Blender"):
         press.set_up_backend(repair=True)
     assert known().state == "outdated"  # still there, and it works
@@ -172,18 +168,6 @@ def test_a_named_python_has_no_tick(wheels, monkeypatch):
     assert preferences._icon(known()) not in ("CHECKMARK", "ERROR")
 
 
-def test_another_python_clears_what_the_one_before_failed_at(wheels, monkeypatch):
-    from blender_primdiffusion.backend.requests import RequestError
-    from blender_primdiffusion.jobs.queue import JobOutcome, queue
-
-    monkeypatch.setattr(session, "error", "The self-test failed: no torch.")
-    failed = {kind: JobOutcome(None, error=RequestError("", "", kind)) for kind in ("environment", "died")}
-    monkeypatch.setattr(queue, "outcomes", failed)
-    preferences._python_changed(None, bpy.context)
-    assert not session.error
-    assert list(queue.outcomes) == ["died"]
-
-
 def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypatch):
     monkeypatch.setattr(ui_setup, "available", dict)
     with refused(RuntimeError, "environment"):
@@ -210,11 +194,10 @@ def test_disabling_the_extension_ends_a_set_up(online, monkeypatch):
     assert not session.busy
 
 
-def test_the_preferences_show_what_was_found_and_what_it_costs(wheels):
+def test_the_preferences_show_what_it_costs(wheels):
     layout = draw_preferences()
-    assert re.search(r"Found: .*Python 3\.\d+", said(layout))
     assert re.search(r"Downloads \d+ MB, takes \d+ MB on disk", said(layout))
-    assert {"compute", "backend_python", "checkpoint", "encoder", "idle_minutes"} <= set(layout.of("prop"))
+    assert {"compute", "backend_python", "checkpoint"} <= set(layout.of("prop"))
 
 
 def test_the_zip_holds_the_locks_and_asks_for_the_network():

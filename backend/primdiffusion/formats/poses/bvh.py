@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...files.regular_files import FileError, as_file_error, read_regular
 from ..joints import JOINT_NAMES
 from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
-from .rigs import MATCH_BONES, UNMATCHED, BoneMap, chosen_bones, map_bones, retarget
+from .rigs import NAME_BONES, UNMATCHED, BoneMap, map_bones, retarget
 from .rotation import about_axis
 from .skeleton import REST_JOINTS
 from .standing import is_standing, straightness
@@ -94,7 +94,7 @@ class Hierarchy:
         return rotations, places
 
 
-def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motion, NDArray[np.float64]]:
+def read_bvh(path: Path) -> tuple[Motion, NDArray[np.float64]]:
     """The motion of a BVH file on SMPL's skeleton, y up judging by the rest pose, and the rotation [3, 3] from the
     file's axes.
 
@@ -102,20 +102,14 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
     which the person stands with straight limbs takes its place.
 
     The root's path is scaled by the length of the legs, so feet slide little. Positions of joints other than the
-    root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
+    root are ignored. Raises FileError.
     """
     hierarchy = parse_bvh(path)
-    names = bone_names(hierarchy)
-    with as_file_error(path, UNMATCHED, MATCH_BONES):
-        bones = map_bones(names) if chosen is None else chosen_bones(names, chosen)
+    with as_file_error(path, UNMATCHED, NAME_BONES):
+        bones = map_bones(name for name in hierarchy.names if not name.endswith("_end"))
     remedy = "export it with a T pose as its first frame"
     with as_file_error(path, "has no rest pose of a human, and no frame in which one stands", remedy):
         return _retarget(hierarchy, bones, path)
-
-
-def bone_names(hierarchy: Hierarchy) -> list[str]:
-    """Names of the file's joints, without end sites."""
-    return [name for name in hierarchy.names if not name.endswith("_end")]
 
 
 def parse_bvh(path: Path) -> Hierarchy:

@@ -66,12 +66,11 @@ _BODY_JOINTS = 22
 """Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
 
-def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None = None, person: str = "") -> Motion:
+def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
     """The motion in a file, y up.
 
-    `up` is the file's axis that points up ("y", "-z", ...), detected where empty; `bones` maps SMPL's joints to the
-    bones of a .bvh, likewise. `person` is one of several in a tracker's output (`Detected.people`); where it is empty,
-    who has the most frames.
+    `up` is the file's axis that points up ("y", "-z", ...), detected where empty. `person` is one of several
+    in a tracker's output (`Detected.people`); where it is empty, who has the most frames.
 
     - .npz of AMASS: `poses` [F, 72 | 156 | 165] (SMPL, SMPL-H, SMPL-X; fingers, jaw and eyes are left out), `trans`,
       `mocap_framerate`, `mocap_frame_rate` or `fps`. z should be up; the actual axis is detected from the pelvis.
@@ -99,7 +98,7 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     axes, expected = np.eye(3), ""
     try:
         if suffix == ".bvh":
-            (motion, axes), expected = read_bvh(path, bones), "y"
+            (motion, axes), expected = read_bvh(path), "y"
         elif suffix in _TREES:
             arrays, lengths = _arrays_of(path, _TREES[suffix](path), person)
             motion = motion_from_arrays(arrays, path)

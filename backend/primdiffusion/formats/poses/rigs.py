@@ -115,11 +115,9 @@ NEEDED = (
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
 """A rig needs these to be posed, and one bone of spine, neck and head."""
-MANUAL = "chosen by hand"
 UNMATCHED = "has bones that cannot be matched to SMPL's joints"
 NAME_BONES = "name them as one of the rigs that the manual lists under Motion"
-MATCH_BONES = f"{NAME_BONES}, or choose one for each joint"
-"""What is wrong with a file where `map_bones` or `chosen_bones` fails, and what to do, without and with a choice."""
+"""What is wrong with a file where `map_bones` fails, and what to do."""
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
 _LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist", "wrist": "hand"}
 """Parts whose direction towards the next part gives their rotation."""
@@ -133,7 +131,7 @@ class BoneMap:
     """Which bone of a rig is which joint."""
 
     rig: str
-    """A key of `RIGS`, or `MANUAL`."""
+    """A key of `RIGS`."""
     joints: dict[str, str]
     """SMPL's joint -> the bone's name; all of `NEEDED`, and other joints that the rig has."""
     tips: dict[str, str]
@@ -157,25 +155,6 @@ def map_bones(names: Iterable[str]) -> BoneMap:
             f"none is known to be {_listed(missing)}; nearest rig: {best.rig}; the bones are {_listed(bones)}"
         )
     return best
-
-
-def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
-    """A bone map chosen by the user, SMPL's joint -> bone; empty bones count as not chosen.
-
-    Raises ValueError for a joint that SMPL does not have, a bone that is not among `names`, and a joint of
-    `NEEDED` without a bone.
-    """
-    bones = list(names)
-    chosen = {joint: bone for joint, bone in joints.items() if bone}
-    for joint, bone in chosen.items():
-        if joint not in JOINT_NAMES:
-            raise ValueError(f"{joint!r} of the bone map is not a joint of SMPL")
-        if bone not in bones:
-            raise ValueError(f"{bone!r:.40}, chosen for {joint}, is not there; the bones are {_listed(bones)}")
-    missing = _missing_joints(chosen)
-    if missing:
-        raise ValueError(f"none is chosen for {_listed(missing)}")
-    return BoneMap(MANUAL, chosen, {})
 
 
 def expected_names(part: str, rig: str, side: str) -> list[str]:

@@ -1,6 +1,5 @@
 """Marched pictures in a 3D view: behind and before its objects, clipped, transparent, beneath bones in front."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import gpu
@@ -96,37 +95,12 @@ def test_a_faint_rim_is_as_far_as_what_it_surrounds():
     assert not shows(seen)[:, 9:].any()
 
 
-def test_a_picture_drawn_again_covers_only_with_opaque_humans_in_front():
-    look = ViewLook(PERSPECTIVE, again=True)
-    depth, colour = np.full(SIZE[::-1], METRES), np.broadcast_to(COLOUR, (*SIZE[::-1], 4)).copy()
-    depth[:, 16:] = NO_SURFACE_M  # the background
-    colour[8:] *= 0.5  # a faint edge
-    seen = shows(drawn(marched(depth, colour), look, window_depth(PERSPECTIVE, METRES + 1)))
-    assert seen[:8, :16].all()
-    assert not seen[8:].any()
-    assert not seen[:, 17:].any()  # column 16 is as far as its neighbour
-    assert not shows(drawn(marched(), look, window_depth(PERSPECTIVE, METRES - 1))).any()
-
-
 def test_xray_shows_humans_through_objects_and_objects_through_humans():
     look = ViewLook(PERSPECTIVE, opacity=0.25, xray=True)
     seen = drawn(marched(), look, window_depth(PERSPECTIVE, 1.0))
     np.testing.assert_allclose(
         seen[..., :3], 0.25 * COLOUR[:3] + np.array([0, 0.75, 0]) + np.zeros_like(seen[..., :3]), atol=2e-3
     )
-
-
-@pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
-def test_clipping_planes_cut_at_their_place_in_the_view(matrix):
-    planes = np.zeros((6, 4), np.float32)
-    planes[2] = [1, 0, 0, -0.3]  # x > 0.3 stays
-    seen = shows(drawn(marched(), dataclasses.replace(ViewLook(matrix), planes=planes)))
-    clip = matrix @ [0.3, 0, -METRES, 1]
-    edge = (clip[0] / clip[3] + 1) / 2 * SIZE[0]
-    assert 1 < edge < SIZE[0] - 1
-    centres = np.arange(SIZE[0]) + 0.5
-    assert seen[:, centres > edge + 0.01].all()
-    assert not seen[:, centres < edge - 0.01].any()
 
 
 def test_outside_of_the_cameras_picture_it_is_darkened():

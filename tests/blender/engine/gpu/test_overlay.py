@@ -1,4 +1,4 @@
-"""What 3D views show of humans beside Blender's objects, and whom a click selects. `test_composite` draws."""
+"""What 3D views show of humans beside Blender's objects. `test_composite` draws."""
 
 import math
 from types import SimpleNamespace
@@ -17,13 +17,11 @@ from blender_primdiffusion.engine.gpu import overlay as module
 from blender_primdiffusion.engine.gpu import scene_reading
 from blender_primdiffusion.engine.gpu.overlay import Overlay
 from blender_primdiffusion.engine.gpu.refine import MarchRequest
-from blender_primdiffusion.engine.view import NO_SURFACE_M, clip_of
+from blender_primdiffusion.engine.view import clip_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of, write_volumes
-from blender_primdiffusion.ui import viewport_humans
-from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
 SIZE = (40, 30)
 LOOK_ALONG_Y = np.linalg.inv(np.array(Matrix.Translation((0.5, -5, 1)) @ Matrix.Rotation(math.pi / 2, 4, "X")))
@@ -216,110 +214,9 @@ def test_bones_are_in_front_while_they_are_posed_or_edited(people, mode):
 
 
 @pytest.mark.any_blender
-@pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
-def test_a_pixel_at_a_depth_is_a_point_of_the_world(matrix):
-    point = module._point(context(matrix), 12, 20, 4.0)
-    clip = matrix @ LOOK_ALONG_Y @ [*point, 1]
-    np.testing.assert_allclose((clip[:2] / clip[3] + 1) / 2 * SIZE, [12.5, 20.5], atol=1e-9)
-    assert (LOOK_ALONG_Y @ [*point, 1])[2] == pytest.approx(-4.0)
-
-
-@pytest.mark.any_blender
 def test_clip_planes_follow_from_the_projection():
     assert clip_of(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
     assert clip_of(PARALLEL) == pytest.approx((-500, 500))
-
-
-def clickable(people, matrix=PERSPECTIVE) -> SimpleNamespace:
-    """The context of a view in which the pelvises, five metres away, fill the whole picture."""
-    depth = SimpleNamespace(read=lambda: np.full(SIZE[::-1], 5.0))
-    people.overlay._regions[1] = SimpleNamespace(shown=SimpleNamespace(picture=SimpleNamespace(depth=depth)))
-    people.overlay.scene_changed()
-    return context(matrix)
-
-
-def pixel_of(matrix, point) -> tuple[int, int]:
-    clip = matrix @ LOOK_ALONG_Y @ [*point, 1]
-    return tuple(((clip[:2] / clip[3] + 1) / 2 * SIZE).astype(int))
-
-
-@pytest.mark.any_blender
-@pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
-def test_a_click_finds_the_nearest_human(people, matrix):
-    around = clickable(people, matrix)
-    for x, name in ((0.0, "Anna"), (1.0, "Bert")):
-        assert people.overlay.object_at(around, *pixel_of(matrix, (x, 0, 1))).name == name
-
-
-@pytest.mark.any_blender
-def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
-    pixel = pixel_of(PERSPECTIVE, (0.0, 0, 1))
-    cube(centre=(0, 2, 1))
-    assert people.overlay.object_at(clickable(people), *pixel).name == "Anna"
-    cube(centre=(0, -1, 1))
-    assert people.overlay.object_at(clickable(people), *pixel) is None
-    people.overlay._regions[1].shown.picture.depth.read = lambda: np.full(SIZE[::-1], NO_SURFACE_M)
-    assert people.overlay.object_at(context(), *pixel) is None
-    people.overlay._regions.clear()
-    assert people.overlay.object_at(context(), *pixel) is None
-
-
-@pytest.mark.any_blender
-def test_clicks_select_extend_and_deselect(people, monkeypatch):
-    monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
-    event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
-    event["value"] = "CLICK"
-
-    def click(extend: bool) -> list[str]:
-        around = clickable(people)
-        around.selected_objects = list(bpy.context.selected_objects)
-        done = PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(extend=extend), around, SimpleNamespace(**event))
-        assert done == {"FINISHED"}
-        return sorted(obj.name for obj in bpy.context.selected_objects)
-
-    for obj in bpy.context.selected_objects:
-        obj.select_set(False)
-    people.bert.select_set(True)
-    assert click(extend=True) == ["Anna", "Bert"]
-    assert bpy.context.view_layer.objects.active == people.anna
-    assert click(extend=True) == ["Bert"]
-    assert click(extend=False) == ["Anna"]
-    around = clickable(people)
-    around.space_data.shading.type, around.scene.render.engine = "RENDERED", "PRIMDIFFUSION"
-    assert PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), around, SimpleNamespace(**event)) == {"PASS_THROUGH"}
-    people.overlay._regions.clear()
-    pass_through = PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), context(), SimpleNamespace(**event))
-    assert pass_through == {"PASS_THROUGH"}
-
-
-@pytest.mark.any_blender
-def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
-    monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
-    click, held, begun = PRIMDIFFUSION_OT_click_human, SimpleNamespace(extend=False), []
-    around = clickable(people)
-    around.selected_objects, around.window_manager = [], SimpleNamespace(modal_handler_add=begun.append)
-    event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
-    assert click.invoke(held, around, SimpleNamespace(value="PRESS", **event)) == {"RUNNING_MODAL", "PASS_THROUGH"}
-    assert begun == [held]
-    assert people.anna.select_get()
-    for kind, value, result in (
-        ("MOUSEMOVE", "NOTHING", {"PASS_THROUGH"}),
-        ("LEFTMOUSE", "CLICK_DRAG", {"FINISHED", "PASS_THROUGH"}),
-        ("LEFTMOUSE", "RELEASE", {"FINISHED"}),
-    ):
-        assert click.modal(held, around, SimpleNamespace(type=kind, value=value)) == result
-
-
-@pytest.mark.any_blender
-def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(people, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(module, "overlay", people.overlay)
-    monkeypatch.setattr(module, "keep_bones_in_front", lambda _context, bones: drawn.append(bones))
-    monkeypatch.setattr(module, "draw_picture", lambda picture, look: drawn.append((picture, look.again)))
-    people.overlay.scene_changed()
-    module.draw_above_overlays(context(), "picture")
-    assert drawn[0] is people.overlay.reading(context()).bones
-    assert drawn[1] == ("picture", True)
 
 
 def drawing(monkeypatch, march) -> list[tuple]:
@@ -399,8 +296,7 @@ def test_a_view_that_the_engine_draws_now_is_not_refined_beside_it(monkeypatch):
     overlay._picture_of(shown.region).want(MarchRequest("before", None, None))
     assert not overlay.resting
     monkeypatch.setattr(module, "overlay", overlay)
-    for name in ("shows_humans", "_shows_overlays"):
-        monkeypatch.setattr(engine, name, lambda _context: False)
+    monkeypatch.setattr(engine, "shows_humans", lambda _context: False)
     monkeypatch.setattr(engine, "bpy", SimpleNamespace(context=shown))
     engine._draw_humans()
     assert overlay.resting

@@ -160,14 +160,6 @@ def sheet(params: dict) -> dict:
     return {"people": people}
 
 
-def open_human(params: dict) -> dict:
-    """Whoever is asked for, they are FAKE_HUMAN's."""
-    person = Path(params["out_dir"]) / PERSON
-    for source, copy in ((HUMAN, person), (HUMAN.with_name(BODY), person.with_name(BODY))):
-        shutil.copyfile(source, copy)
-    return {"person": str(person)}
-
-
 def posture(params: dict) -> dict:
     """What was given, or a T pose, with the left arm down, the pelvis moved, and a lens a tenth longer."""
     path = Path(params["out_dir"]) / "posture.json"
@@ -253,7 +245,6 @@ ANSWERS: dict[str, tuple[Callable[[dict], Steps], Callable[[dict], dict]]] = {
     "variations": (sheet_steps, sheet),
     "reconstruct": (steps("encode", lambda _: 4), reconstructed),
     "fit_posture": (steps("fit", lambda _: 4), posture),
-    "open_human": (at_once, open_human),
     "render": (at_once, picture),
     "draw": (bands, nothing),
     "merge": (merging, merged),

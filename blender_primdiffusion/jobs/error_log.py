@@ -1,13 +1,10 @@
-"""Errors of jobs, the button that helps, and the log for a bug report."""
+"""Errors of jobs, and the log for a bug report."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import errno
 import os
 import platform
-import re
 import tempfile
 import tomllib
 import traceback
@@ -18,60 +15,14 @@ from typing import Any
 import bpy
 
 from ..backend.requests import RequestError, error_text, sentence
-from ..places import EXTENSION, INSTALLS_BACKEND
+from ..places import EXTENSION
 
 _LOG_LINES = 40
-
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
-
-
-@dataclasses.dataclass(frozen=True)
-class Remedy:
-    """A button."""
-
-    operator: str
-    label: str
-    icon: str
-    properties: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-
-_PREFERENCES = Remedy("preferences.addon_show", "Open Preferences", "PREFERENCES", {"module": EXTENSION})
-_SAVE_AS = Remedy("wm.save_as_mainfile", "Save As...", "FILE_TICK")
-_REMEDIES = {
-    "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT")
-    if INSTALLS_BACKEND
-    else _PREFERENCES,
-    "out_of_memory": Remedy("primdiffusion.cancel", "Release Memory", "MEMORY", {"what": "MEMORY"}),
-    "missing_file": _PREFERENCES,  # a checkpoint's path
-    "unwritable": _SAVE_AS,
-    "file_system": _SAVE_AS,
-}
-"""By the kind of error."""
-_PREFERENCE_ERRORS = re.compile("checkpoint|encoder|safetensors")
-"""Other missing files, such as captures, are chosen in their panels."""
-
-
-def remedy_for(error: RequestError) -> Remedy | None:
-    """The button for an error, if there is one; for others, the button that was pressed is the one to press again."""
-    remedy = _REMEDIES.get(error.kind)
-    if remedy is None or (error.kind == "missing_file" and not _PREFERENCE_ERRORS.search(error.message)):
-        return None
-    return remedy
 
 
 def error_in_the_scene(error: Exception) -> RequestError:
     """The error of a result that could not enter the scene; an exception may have an attribute `kind`."""
-    kind = getattr(error, "kind", "scene")
-    cause = error if isinstance(error, OSError) else error.__cause__
-    while cause is not None and not getattr(cause, "errno", None):
-        cause = cause.__cause__
-    if cause is not None and cause.errno in _DISK_FULL:
-        return RequestError(
-            sentence(error),
-            "Save the file in a folder with free space and write permission, then try again",
-            "unwritable",
-        )
-    return RequestError(sentence(error), "", str(kind))
+    return RequestError(sentence(error), "", str(getattr(error, "kind", "scene")))
 
 
 def defect_in_the_scene(error: Exception) -> RequestError:

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -17,12 +18,11 @@ from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.human import BETAS, humans, proxy_of
+from blender_primdiffusion.scene.human import BETAS, BODY_FILE, humans, proxy_of
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.representation import show_in_viewport
 from blender_primdiffusion.scene.volume_nodes import volumes_of
-from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
-from blender_primdiffusion.ui.export_panel import draw_as_mesh
+from blender_primdiffusion.ui.export_panel import PRIMDIFFUSION_OT_export
 
 pytestmark = pytest.mark.any_blender
 
@@ -130,22 +130,6 @@ def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
     assert not volumes_of(anna).hide_render
 
 
-def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
-    def drawn() -> dict[str, str]:
-        layout = MagicMock()
-        draw_as_mesh(layout, bpy.context)
-        made = (*layout.row().operator.call_args_list, *layout.grid_flow().operator.call_args_list)
-        return {call.kwargs["text"]: call.kwargs.get("depress") for call in made}
-
-    assert drawn() == {"As Mesh": None}
-    OPERATORS.add_proxy()
-    assert {"Mesh": False, "Mesh in Viewport": True, "Volumes": False}.items() <= drawn().items()
-    OPERATORS.set_representation(representation="NO_MESH")
-    assert drawn() == {"As Mesh": None}
-    bpy.context.scene.collection.children.unlink(bpy.data.collections[anna.name])
-    assert drawn() == {}
-
-
 def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
     before = everything()
     OPERATORS.add_proxy()
@@ -169,57 +153,33 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
     assert np.array(asked["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
 
 
-def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
-    moving(anna)
-    anna.location = (2.0, 0.0, 0.0)
-    bpy.context.scene.primdiffusion_export.voxel = 0.01
-    OPERATORS.export(filepath=str(out / "Anna.vdb"))
-    assert sorted(path.name for path in out.iterdir()) == [f"Anna_{frame:04d}.vdb" for frame in (1, 2, 3)]
-    bpy.utils.expose_bundled_modules()
-    import openvdb
-
-    grids, _ = openvdb.readAll(str(out / "Anna_0002.vdb"))
-    assert {grid.name for grid in grids} == {"density", "Cd"}
-    assert grids[0].transform.indexToWorld((0, 0, 0))[0] == pytest.approx(2.0, abs=1e-6)
-
-
-def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
-    turns = moving(anna)
-    armature = anna
+def test_a_human_file_goes_out_and_comes_back_with_its_shape(anna, store, out):
     shape = np.linspace(-1, 1, 10)
-    armature[BETAS] = shape.tolist()
-    bpy.context.scene.primdiffusion_export.motion = True
+    anna[BETAS] = shape.tolist()
     OPERATORS.export(filepath=str(out / "Anna Müller.human"))
     kept = read_tensors(out / "Anna Müller.human")
     assert json.loads(kept.metadata["provenance"]) == json.loads(str(synthetic.arrays(8)["meta"]))
     assert np.frombuffer(kept.arrays["betas"][2], "<f4") == pytest.approx(shape, abs=1e-6)
+    with pytest.raises(RuntimeError, match="body's file is missing"):
+        OPERATORS.import_human(filepath=str(out / "Anna Müller.human"))
+    shutil.copyfile(store / BODY_FILE, out / BODY_FILE)
     OPERATORS.import_human(filepath=str(out / "Anna Müller.human"))
     other = next(person for person in humans(bpy.context.scene) if person != anna)
     assert other.name == "Anna Müller"
-    bpy.context.scene.frame_set(2)
-    for bone in synthetic.NAMES:
-        mine, theirs = (person.pose.bones[bone] for person in (anna, other))
-        assert np.abs(np.array(mine.matrix) - np.array(theirs.matrix)).max() < 1e-4
-    assert len(turns) == 3
+    assert np.array(other[BETAS]) == pytest.approx(shape, abs=1e-6)
 
 
-def test_a_mirrored_bone_is_exported_as_a_turn_that_can_be_imported(anna, out):
-    moving(anna)
-    anna.pose.bones["left_elbow"].scale = (-1, 2, 1)
-    bpy.context.scene.primdiffusion_export.motion = True
-    OPERATORS.export(filepath=str(out / "a.human"))
-    assert OPERATORS.import_human(filepath=str(out / "a.human")) == {"FINISHED"}
-
-
-def test_a_human_file_without_motion_holds_the_person_alone(anna, out):
+def test_a_human_file_holds_the_person_alone(anna, out):
     OPERATORS.export(filepath=str(out / "a"))
     kept = read_tensors(out / "a.human")
-    assert "motion" not in kept.metadata
     assert set(kept.arrays) == {"rgb", "density", "delta_scale", "betas", "rest_half_extent"}
 
 
-def test_a_person_is_put_where_they_were_dropped(store):
-    OPERATORS.import_human(filepath=str(store / "person.human.safetensors"), location=(1.0, 2.0, 0.0))
+def test_a_file_is_imported_at_the_cursor_in_edit_mode_too(store):
+    bpy.ops.mesh.primitive_cube_add(location=(9.0, 9.0, 9.0))
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.context.scene.cursor.location = (1.0, 2.0, 0.0)
+    OPERATORS.import_human(filepath=str(store / "person.human.safetensors"))
     person = humans(bpy.context.scene)[0]
     assert person.location.xy[:] == pytest.approx((1.0, 2.0))
     assert person.name == "person"
@@ -249,7 +209,7 @@ class Dialog:
         ("GLB", "/a/Anna.human", "/a/Anna.glb"),
         ("USD", "/a/Anna.usdz", "/a/Anna.usdz"),
         ("HUMAN", "/a/Anna v1.2", "/a/Anna v1.2.human"),
-        ("VDB", "", ""),
+        ("PLY", "", ""),
     ],
 )
 def test_another_format_in_the_file_browser_changes_the_extension(anna, format, before, after):
