@@ -114,8 +114,8 @@ def test_a_child_that_dies_between_jobs_is_noticed(addon):
     assert queue.child_message == ""
 
 
-def test_out_of_memory_names_the_setting_to_lower_and_not_the_steps(addon):
-    with refused(RuntimeError, "preferences"):
+def test_out_of_memory_is_the_backends_own_sentence(addon):
+    with refused(RuntimeError, "memory"):
         ops.generate(seed=NO_MEMORY)
 
 
