@@ -37,7 +37,6 @@ from ..files.arrays import all_finite
 from ..files.json_files import read_json
 from ..files.regular_files import FileError, as_file_error, printable
 from ..formats.camera_rig import Rig, View
-from ..formats.capture_repair import repair, verify
 from ..formats.poses.files import ENDINGS
 from ..formats.requests import PASSES
 from .job import CaptureProgress, run
@@ -86,8 +85,6 @@ def parser() -> CommandParser:
     declared(CaptureSettings, "threads")
     declared(CaptureSettings, "released_reference")
     add("--list", action="store_true", help="list the subjects of the shard, render nothing")
-    add("--verify", action="store_true", help="check the dataset, render nothing")
-    add("--repair", action="store_true", help="with --verify: remove damaged files; without: then render them again")
     add("--progress", choices=("text", "json", "none"), default="text", help="on stdout")
     add("--while-stdin", action="store_true", help="stop when stdin ends: for programs that start this one")
     return made
@@ -191,10 +188,6 @@ def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
 
 
 def _run(options: argparse.Namespace, say: Say, stopped: Callable[[], bool]) -> int:
-    if options.verify or (options.repair and not options.people):
-        return _check(options, say)
-    if options.repair and options.out.exists():
-        _check(options, say)
     settings = settings_of(options)
     if settings.together > 1 and options.only:
         raise ValueError("people who stand together need each other: give --shard instead of --only")
@@ -205,16 +198,6 @@ def _run(options: argparse.Namespace, say: Say, stopped: Callable[[], bool]) -> 
             say(scan.name)
         return DONE
     return _render(options, settings, scans, say, stopped)
-
-
-def _check(options: argparse.Namespace, say: Say) -> int:
-    wrong = verify(options.out)
-    if options.repair:
-        repair(options.out, wrong)
-    for path, what in wrong.items():
-        say(f"{path}: {what}")
-    say(f"{options.out}: {f'{len(wrong)} problems' if wrong else 'no problems'}")
-    return FAILED if wrong else DONE
 
 
 def _render(

@@ -1,4 +1,4 @@
-"""The sidebar panel Captures: render, verify, and a preview of the cameras; and the extension's command line,
+"""The sidebar panel Captures: render, and a preview of the cameras; and the extension's command line,
 `blender -c primdiffusion capture ...`."""
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from ..console import DONE, UNUSABLE
 from ..formats.camera_rig import bounding_sphere
 from ..jobs.follow import Reporting
 from ..places import shows_captures
-from ..scene.blend_values import setting_path
 from ..scene.convention import points_to_backend
 from .captures_settings import captures, capturing, command_args
 from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
@@ -45,25 +44,6 @@ class PRIMDIFFUSION_OT_render_captures(Reporting, bpy.types.Operator):
         args = command_args(settings, context, folder) + shlex.split(self.options)
         settings_of(parse(args))  # report impossible settings at once
         captures.start(capturing(args, folder))
-        return captures.follow(self)
-
-
-class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
-    """Read every file of the captures and report what is missing, truncated or altered"""
-
-    bl_idname = "primdiffusion.verify_captures"
-    bl_label = "Verify"
-
-    repair: bpy.props.BoolProperty(
-        name="Repair", description="Remove damaged files, so that the next run renders only those again"
-    )
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        out = setting_path(context.scene.primdiffusion_captures.out, "Captures")
-        if not out:
-            raise ValueError("choose the folder of captures first")
-        args = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
-        captures.start(capturing(args, _temporary_folder()))
         return captures.follow(self)
 
 
@@ -166,7 +146,7 @@ def _draw_settings(layout: bpy.types.UILayout, asked, context: bpy.types.Context
         ("Poses", ("poses", "pose_count", "together"), None),
         ("Cameras", _cameras(asked), _draw_preview),
         ("Cycles", _cycles(asked), None),
-        ("Output", _OUTPUT, _draw_verify),
+        ("Output", _OUTPUT, None),
     )
     for text, names, more in sections:
         body = draw_section(layout, f"captures_{text.lower()}", text=text)
@@ -201,12 +181,6 @@ def _draw_preview(layout: bpy.types.UILayout, asked, context: bpy.types.Context)
         layout.operator("primdiffusion.preview_rig", text=text, icon="CAMERA_DATA")
     elif asked.cameras is None:
         layout.label(text="Without a collection: the selected cameras", icon="INFO")
-
-
-def _draw_verify(layout: bpy.types.UILayout, _asked, _context) -> None:
-    row = layout.row(align=True)
-    row.operator("primdiffusion.verify_captures", icon="CHECKMARK").repair = False
-    row.operator("primdiffusion.verify_captures", text="Repair", icon="TOOL_SETTINGS").repair = True
 
 
 COMMAND = "primdiffusion"

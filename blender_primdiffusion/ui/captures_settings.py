@@ -17,7 +17,7 @@ from ..backend.requests import Step, Steps
 from ..capture.cameras import view_of
 from ..capture.command import MARK
 from ..capture.settings import CaptureSettings
-from ..console import DONE, FAILED, duration
+from ..console import DONE, duration
 from ..files.json_files import parse_message
 from ..files.regular_files import remove_folder
 from ..formats.answers import CapturesProgress
@@ -218,7 +218,7 @@ def capturing(words: Sequence[str], folder: Path) -> Steps:
                     said = [*said, *step.lines][-2:]
                     yield step
             yield Step(step.message, step.fraction)
-        if exit_code == DONE or (exit_code == FAILED and "--repair" in words):  # what was damaged is mended then
+        if exit_code == DONE:
             return said[-1]
         complaints = [line.removeprefix("capture: ") for line in errors.log() if line.startswith("capture: ")]
         raise RuntimeError("; ".join(complaints[-1:] or said) or f"Blender ended with code {exit_code}")

@@ -18,6 +18,7 @@ from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.human import Human, place
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import K, Payload, S
+from support.capture_files import faults
 from support.errors import refused
 
 SIZE, FRAMES, CAMERAS = 96, 2, 3
@@ -140,7 +141,7 @@ def test_captures_of_both_kinds_say_so(whole):
     assert about["passes"] == ["img", "mask", "depth"]
     assert about["renderer"] == "rasteriser and marcher"
     assert open_captures(whole / "captures").subjects == ("ada", "box")
-    assert capture_layout.damage(whole / "captures" / "ada") == {}
+    assert not faults(whole / "captures")
     betas = open_captures(whole / "captures").subject("ada").smpl.betas
     assert betas.tolist() == [1.0, -1.0] + [0.0] * 8
 

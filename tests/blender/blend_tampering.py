@@ -282,7 +282,7 @@ def _menus() -> list[type]:
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
     ("set_representation", {"representation": "VOLUMES"}), ("reshape", {"to": "GENERATED"}),
-    ("human_from_captures", {}), ("verify_captures", {}),
+    ("human_from_captures", {}),
     ("set_representation", {"representation": "NO_MESH"}), ("merge", {"what": "NOTHING"}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""

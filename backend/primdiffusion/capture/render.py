@@ -28,7 +28,6 @@ from primdiffusion.files.regular_files import check_unlinked
 from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
-from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.group_places import extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
@@ -166,7 +165,7 @@ def render_frames(
     for frame in frames:
         draw = None
         for camera, view in enumerate(setup.views):
-            if not is_complete_view(subject, passes, camera, frame):
+            if not capture_layout.is_complete_view(subject, passes, camera, frame):
                 draw = draw or setup.person.posed(setup.skinning[frame])
                 write_view(subject, passes, camera, frame, draw(view, samples))
             yield frame, camera
@@ -261,7 +260,7 @@ class SubjectResult:
 def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
     """Render all subjects; yields the result of each. A failed subject does not stop the others.
 
-    A subject is skipped if it has a complete.json and all its files have the sizes listed there.
+    A subject is skipped if it has a complete.json, and a view if all its images exist.
 
     Raises:
         FileError: the folder contains something else.
@@ -285,10 +284,10 @@ def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
 def _outcomes(job: RenderJob, workers: int) -> Iterator[SubjectResult]:
     waiting = []
     for name in job.people:
-        if capture_layout.damage(job.out / name, checksums=False):
-            waiting.append(name)
-        else:
+        if capture_layout.is_complete(job.out / name):
             yield SubjectResult(name, "skipped")
+        else:
+            waiting.append(name)
     shares = _shares(len(job.poses.translation), math.ceil(workers / max(len(waiting), 1)))
     if workers == 1:
         for name in waiting:
@@ -356,7 +355,7 @@ def _finish(job: RenderJob, name: str, outcomes: Sequence[SubjectResult]) -> Sub
 
 def _write_report(job: RenderJob, outcomes: Sequence[SubjectResult]) -> None:
     """Write the list of finished subjects and the report."""
-    list_subjects(job.out)
+    capture_layout.list_subjects(job.out)
     report = {
         "done": [outcome.subject for outcome in outcomes if outcome.status == "done"],
         "failed": [{"subject": "", "what": "poses", "why": error} for error in job.unread_poses]

@@ -1,4 +1,4 @@
-"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, export, coco and farm."""
+"""Multi-view captures: `primdiffusion captures` render, info, sheet, export, coco and farm."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.camera_files import Project, export_cameras
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.composed import Backgrounds
-from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.poses import choose_poses, read_motions
 from primdiffusion.capture.reader import open_captures
@@ -29,7 +28,6 @@ from primdiffusion.evaluation.images import folder_pictures
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
-from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.schema import Range, check
@@ -166,32 +164,6 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 @dataclasses.dataclass(frozen=True)
-class VerifyCaptures:
-    """Find damaged, missing and unfinished files."""
-
-    root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset."""
-    repair: bool = False
-    """Remove damaged files, so that the command that rendered them renders them again."""
-    quick: bool = False
-    """Compare sizes instead of checksums."""
-
-    def run(self) -> None:
-        """Print a line for each finding; raises ValueError if there is any."""
-        findings = verify(self.root, checksums=not self.quick)
-        for path, what in findings.items():
-            print(printable(f"{path}: {what}"))
-        if not findings:
-            print(f"{self.root}: {len(subject_folders(self.root))} subjects, nothing wrong")
-            return
-        remedy = "--repair removes what is damaged, to be rendered again"
-        if self.repair:
-            repair(self.root, findings)
-            remedy = "damaged files are removed: give the command that rendered them again"
-        raise ValueError(f"{len(findings)} things are wrong in {self.root}: {remedy}")
-
-
-@dataclasses.dataclass(frozen=True)
 class InfoOfCaptures:
     """Describe a capture dataset, as JSON."""
 
@@ -209,27 +181,10 @@ class InfoOfCaptures:
             "cameras": len(first.views),
             "size": [view.width, view.height],
             "passes": captures.passes,
-            "packed": sum(open_pack(captures.subject(name)) is not None for name in captures.subjects),
             "first_subject": first.name,
             "dataset": captures.about or "released layout, without dataset.json",
         }
         print(json.dumps(about, indent=2))
-
-
-@dataclasses.dataclass(frozen=True)
-class PackCaptures:
-    """Pack images and masks into an array per subject that training maps into memory: large, but quick to read."""
-
-    root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset; the arrays go to its folder `packed`."""
-
-    def run(self) -> None:
-        """Pack, and print a line for each subject."""
-        captures = open_captures(self.root)
-        for packing in tqdm(pack(captures), total=len(captures.subjects), unit="human", disable=None):
-            print(
-                f"{packing.subject}  {'found' if packing.found else 'packed'}  {packing.gigabytes:.3f} GB", flush=True
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -321,9 +276,7 @@ class FarmCaptures(Farm):
 
 Command = (
     Annotated[RenderCaptures, tyro.conf.subcommand("render")]
-    | Annotated[VerifyCaptures, tyro.conf.subcommand("verify")]
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
-    | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
     | Annotated[ExportCaptures, tyro.conf.subcommand("export")]
     | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]

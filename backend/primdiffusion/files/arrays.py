@@ -121,14 +121,12 @@ def check_shapes(
 
 def read_npy(path: Source) -> NDArray:
     """Read an .npy file. Raises as `read_arrays`."""
-    with _npy(path) as stream:
+    with open_regular(path, LARGEST_BYTES) as stream, _damage_named(path):
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        _header(stream, size, path)
+        stream.seek(0)
         return np.load(stream, allow_pickle=False)
-
-
-def map_npy(path: str | Path) -> NDArray:
-    """Map an .npy file of any size into memory, read-only. Raises as `read_arrays`."""
-    with _npy(path, 2**62):
-        return np.load(path, "r", allow_pickle=False)
 
 
 def read_pickled_bytes(path: str | Path, name: str) -> bytes:
@@ -172,17 +170,6 @@ def _damage_named(path: Source) -> Iterator[None]:
 def _archive(path: Source) -> Iterator[zipfile.ZipFile]:
     with open_regular(path, LARGEST_FILE) as file, _damage_named(path), zipfile.ZipFile(file) as archive:
         yield archive
-
-
-@contextlib.contextmanager
-def _npy(path: Source, limit: int = LARGEST_BYTES) -> Iterator[BinaryIO]:
-    """Open an .npy file, whose header was checked."""
-    with open_regular(path, limit) as stream, _damage_named(path):
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(0)
-        _header(stream, size, path)
-        stream.seek(0)
-        yield stream
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:

@@ -1,7 +1,6 @@
 """Captures read back, ours and in the released layout, whole and damaged."""
 
 import json
-import os
 import shutil
 import struct
 import zlib
@@ -9,18 +8,15 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from capture_scenes import small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.dataset import PACK_FOLDER, pack
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.render import render, set_up_capture
+from primdiffusion.capture.render import set_up_capture
 from primdiffusion.capture.sheet import body_joints, draw_sheet, reprojection_error
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.capture_repair import verify
 from support.errors import refused
 
 NAME = "person_000000"
@@ -169,32 +165,10 @@ def test_frames_and_cameras_that_are_not_there_are_rejected(root):
             open_captures(root).view(NAME, frame, camera)
 
 
-def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, fails):
-    cli.main(["captures", "verify", str(root)])
-    cut, altered, stray = (
-        root / NAME / file
-        for file in ("depth/camera0001/0002.png", "part/camera0003/0000.png", ".x.0a1b2c3d-9-4e5f6a7b.partial.png")
-    )
-    cut.write_bytes(cut.read_bytes()[:-4])
-    data = bytearray(altered.read_bytes())
-    data[50] ^= 1
-    altered.write_bytes(data)
-    stray.touch()
-    os.utime(stray, (0, 0))  # old: its writer has ended
-    assert list(verify(root)) == [cut, altered, stray]
-    assert list(verify(root, checksums=False)) == [cut, stray]
-    assert str(cut) in fails("captures", "verify", root, "--repair").out
-    assert not any(path.exists() for path in (cut, altered, stray))
-    assert capture_layout.picture_path(root / NAME, "img", 0, 0).exists()
-    assert open_captures(root).subjects == ("person_000001",)
-    assert sorted(outcome.status for outcome in render(small_job(root.parent))) == ["done", "skipped"]
-    assert verify(root) == {}
-
-
 def test_info_and_sheet_say_and_show_what_is_there(root, tmp_path, capsys):
     cli.main(["captures", "info", str(root)])
     about = json.loads(capsys.readouterr().out)
-    assert [about[key] for key in ("subjects", "frames", "cameras", "size", "packed")] == [2, 3, 4, [32, 32], 0]
+    assert [about[key] for key in ("subjects", "frames", "cameras", "size")] == [2, 3, 4, [32, 32]]
     assert draw_sheet(open_captures(root), tmp_path / "sheet.png", rows=6, columns=3, size=64) < 1e-3
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.size == (3 * 64, 6 * 64)
@@ -207,14 +181,6 @@ def test_depth_with_several_channels_is_rejected(root, mode):
     Image.new(mode, Image.open(path).size).save(path)
     with refused(FileError, "channels"):
         open_captures(root).view(NAME, 0, 0)
-
-
-def test_a_pack_is_not_written_through_a_link(root, tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    (root / PACK_FOLDER).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(FileError):
-        list(pack(open_captures(root)))
-    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def claim_pixels(root, width, height, padding=0):

@@ -14,6 +14,7 @@ import pytest
 from blender_primdiffusion.formats.capture_layout import picture_path
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from capture_person import _few_faces, chequers, files_of
+from support.capture_files import faults
 from support.errors import refused
 
 import blender_primdiffusion
@@ -124,18 +125,16 @@ def start(settings, tmp_path) -> None:
 
 def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
     before = {(block.id_type, block.name) for block in data_blocks()}
-    out, verify = tmp_path / "captures", bpy.ops.primdiffusion.verify_captures
+    out = tmp_path / "captures"
     assert render(only_good, out) == {"FINISHED"}
     assert {(block.id_type, block.name) for block in data_blocks()} == before
     assert (out / "release_human_list.txt").read_text() == "anna\n"
     assert json.loads((out / "dataset.json").read_text())["frames"] == 2
-    assert verify() == {"FINISHED"}
+    assert not faults(out)
     picture_path(out / "anna", "depth", 1, 1).unlink()
-    with refused(RuntimeError, "1 problems", "0001.png"):
-        verify()
-    assert verify(repair=True) == {"FINISHED"}
+    (out / "anna" / "complete.json").unlink()
     assert render(only_good, out) == {"FINISHED"}
-    assert verify() == {"FINISHED"}
+    assert not faults(out)
 
 
 def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
@@ -165,17 +164,7 @@ def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people
     again = command("--people", str(people), "--out", str(out), *SMALL.split(), "--only", "person_000000")
     assert again.returncode == DONE
     assert "1 were there" in again.stdout
-    checked = command("--out", str(out), "--verify")
-    assert checked.returncode == DONE, checked.stdout  # nothing of the broken scan has come into the dataset
-    picture = picture_path(out / "person_000000", "img", 0, 0)
-    whole = picture.read_bytes()
-    picture.write_bytes(whole[: len(whole) // 2])
-    checked = command("--out", str(out), "--verify", "--repair")
-    assert checked.returncode == FAILED
-    assert str(picture) in checked.stdout
-    assert not picture.exists()
-    command("--people", str(people), "--out", str(out), *SMALL.split(), "--only", "person_000000")
-    assert picture.read_bytes() == whole
+    assert not faults(out)  # nothing of the broken scan has come into the dataset
 
 
 def test_a_wrong_command_line_exits_with_2_and_an_error(tmp_path):
