@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from primdiffusion.files.regular_files import as_file_error, open_regular, read_regular, real_path
-from primdiffusion.geometry.pictures import decoded, opened_picture, strips
+from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 
 ENVIRONMENT_VARIABLE = "PRIMDIFFUSION_ASSETS"
@@ -134,13 +134,8 @@ def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def _shrunk(picture: Image.Image, width: int) -> UInt8[np.ndarray, "H W 4"]:
-    """Shrink to a width, strip by strip: Pillow filters rows, rounds, and then columns, so the result is the same."""
-    narrow = Image.new("RGBa", (width, picture.height))
-    for top, strip in strips(picture):
-        premultiplied = strip.convert("RGBA").convert("RGBa")
-        narrow.paste(premultiplied.resize((width, strip.height), Image.Resampling.BOX), (0, top))
     size = (width, max(1, round(picture.height * width / picture.width)))
-    return np.array(narrow.resize(size, Image.Resampling.BOX).convert("RGBA"))
+    return np.array(picture.convert("RGBA").convert("RGBa").resize(size, Image.Resampling.BOX).convert("RGBA"))
 
 
 UNKNOWN = "unknown"

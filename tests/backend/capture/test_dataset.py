@@ -48,13 +48,14 @@ def test_a_batch_holds_views_cameras_poses_and_shapes(captures):
 def test_a_sample_is_what_the_reader_reads(captures):
     sample = CaptureDataset(captures, SampleSettings(1, 3, 32, "whole", "same"))[0, 4]
     name, frame = captures.subjects[int(sample.subject)], int(sample.frame)
-    views = [captures.view(name, frame, camera) for camera in range(4)]
+    subject = captures.subject(name)
+    views = [torch.from_numpy(subject.picture("img", frame, camera)) for camera in range(4)]
     shown = torch.cat([sample.conditioning.image, sample.target.image])
-    numbers = [next(i for i, view in enumerate(views) if torch.equal(view.image, image)) for image in shown]
+    numbers = [next(i for i, view in enumerate(views) if torch.equal(view, image)) for image in shown]
     assert sorted(numbers) == [0, 1, 2, 3]
-    for view, camera in zip([views[i] for i in numbers[1:]], sample.target.camera.world_to_camera, strict=True):
-        assert torch.equal(view.camera.world_to_camera, camera)
-    assert torch.equal(sample.target.pose.joint_rotation, views[0].pose.joint_rotation)
+    for number, camera in zip(numbers[1:], sample.target.camera.world_to_camera, strict=True):
+        assert torch.equal(subject.camera(number).world_to_camera, camera)
+    assert torch.equal(sample.target.pose.joint_rotation, subject.smpl.pose(frame).joint_rotation)
 
 
 def test_conditioning_views_of_the_first_frame_show_the_near_t_pose(captures):
