@@ -1,6 +1,5 @@
 """COCO annotations of captures: as pycocotools reads them, and against masks, joints and rays cast at the mesh."""
 
-import csv
 import dataclasses
 import json
 
@@ -26,7 +25,7 @@ from support.capture_files import faults
 from support.errors import refused
 
 NAME = "person_000000"
-WRITTEN = ("annotations.json", "images.csv")
+WRITTEN = ("annotations.json",)
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +193,7 @@ def test_the_face_is_that_of_the_whole_body(bodies):
 
 def test_the_command_writes_the_same_bytes_again_and_rendering_goes_on(root, whole, capsys):
     cli.main(["captures", "coco", str(root)])
-    assert all(name in capsys.readouterr().out for name in WRITTEN[1:])
+    assert WRITTEN[0] in capsys.readouterr().out
     first = [(root / name).read_bytes() for name in WRITTEN]
     before = {path: path.read_bytes() for path in whole.rglob("*") if path.is_file()}
     cli.main(["captures", "coco", str(root)])
@@ -207,29 +206,12 @@ def test_the_command_writes_the_same_bytes_again_and_rendering_goes_on(root, who
     capture_layout.claim(root, capture_layout.read_about(root))
 
 
-def test_the_table_has_a_line_for_each_image_and_the_attributes_of_its_human(root):
-    write_coco(open_captures(root), {NAME: {"sex": "female", "height": 1.5}, "person_000001": {"hat": "none, at all"}})
-    with (root / "images.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 3 * 4
-    images = annotations(root)["images"]
-    assert [int(row["image_id"]) for row in rows] == [image["id"] for image in images] == list(range(1, 25))
-    for row, image in zip(rows, images, strict=True):
-        assert [row["file_name"], row["subject"], int(row["frame"]), int(row["camera"])] == [
-            image["file_name"],
-            *image["subjects"],
-            image["frame"],
-            image["camera"],
-        ]
-    assert [rows[0][name] for name in ("hat", "height", "sex")] == ["", "1.5", "female"]
-    assert [rows[-1][name] for name in ("hat", "height", "sex")] == ["none, at all", "", ""]
-
-
 def test_attributes_come_from_the_folder_of_people(root):
     people = root.parent / "people"
     (people / NAME / "person.json").write_text(json.dumps({"seed": 0, "attributes": {"outfit": "suit"}}))
     cli.main(["captures", "coco", str(root), "--people", str(people)])
-    assert (root / "images.csv").read_text().splitlines()[1].endswith(",suit")
+    for one in annotations(root)["annotations"]:
+        assert one.get("attributes", {}) == ({"outfit": "suit"} if one["subject"] == NAME else {})
 
 
 def test_an_image_without_its_subject_has_no_annotation(root):
@@ -345,9 +327,7 @@ def test_damage_is_named_and_the_earlier_files_stay(root):
     capture_layout.write_npz(root / NAME / "joints.npz", world=np.zeros((3, 23, 3)))
     with refused(FileError, "joints.npz"):
         write_coco(open_captures(root), {})
-    with refused(ValueError, "attributes"):
-        write_coco(open_captures(root), {NAME: ["tall"]})  # type: ignore
-    assert [(root / name).read_text() for name in WRITTEN] == ["earlier", "earlier"]
+    assert [(root / name).read_text() for name in WRITTEN] == ["earlier"]
     assert not list(root.glob(".*"))
 
 
