@@ -13,10 +13,10 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from .regular_files import check_inside, open_to_append, real_path, remove_file, remove_folder
+from .regular_files import check_inside, open_to_append, remove_file, remove_folder
 
 if sys.platform == "win32":
     import msvcrt
@@ -44,14 +44,17 @@ def temporary_folder(path: Path) -> Iterator[Path]:
         remove_folder(folder, folder.parent)
 
 
-def remove_abandoned(folder: Path, of: Path | None = None) -> None:
-    """Remove what killed processes left in a folder, only what was to become `of` if given. Raises no OSError."""
+def remove_abandoned(folder: Path, of: Path | None = None, after_s: float = ABANDONED_AFTER_S) -> None:
+    """Remove what killed processes left in a folder, only what was to become `of` if given. Raises no OSError.
+
+    Who holds the folder alone (`folder_lock`) knows that no other process writes there: `after_s` is 0 then.
+    """
     for path, named in _temporary_files(folder):
         if of is None or (named["stem"], named["suffix"] or "") == (of.stem, of.suffix):
             with contextlib.suppress(OSError):
                 inside = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
                 newest = max(entry.lstat().st_mtime for entry in (path, *inside))
-                if time.time() - newest > ABANDONED_AFTER_S:
+                if time.time() - newest >= after_s:
                     _remove(path)
 
 
@@ -112,57 +115,42 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def staged(folder: str | Path, last: str = "") -> Iterator[Path]:
-    """Yield a temporary folder inside `folder`, to which its files move at the end, replacing files of the same names.
+def staged(folder: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder inside `folder`, to which its files and folders move at the end, replacing those of the
+    same names.
 
-    The file named `last` moves last. After an error everything is removed, including a newly created `folder`. Raises
-    OSError, naming the file in `folder`; at once if it cannot be written to.
+    After an error everything is removed, including a newly created `folder`. Raises OSError, naming the file in
+    `folder`; at once if it cannot be written to.
     """
-    with staged_together([folder], last) as (aside,):
-        yield aside
-
-
-@contextlib.contextmanager
-def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[list[Path]]:
-    """`staged` for several folders, whose files move at the end."""
-    targets = [Path(folder) for folder in folders]
-    made: list[Path] = []
-    asides: list[Path] = []
+    target, made = Path(folder), []
+    aside = temporary_name(target / "files")
     try:
-        for target in targets:
-            made += create_folders(target)
-            remove_abandoned(target)
-            asides.append(temporary_name(target / "files"))
-            asides[-1].mkdir()
-        yield asides
-        publish(list(zip(asides, targets, strict=True)), last)
+        made = _create_folders(target)
+        remove_abandoned(target)
+        aside.mkdir()
+        yield aside
+        publish(aside, target)
         made = []
     except OSError as e:
-        for aside, target in zip(asides, targets, strict=False):
-            if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
-                raise type(e)(e.errno, e.strerror, str(target / path.relative_to(aside))) from e
+        if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
+            raise type(e)(e.errno, e.strerror, str(target / path.relative_to(aside))) from e
         raise
     finally:
-        for aside in asides:
-            remove_folder(aside, aside.parent)
-        remove_empty(made)
+        if target.is_dir():
+            remove_folder(aside, target)
+        for path in made:
+            with contextlib.suppress(OSError):  # in use
+                path.rmdir()
 
 
-def publish(moves: Sequence[tuple[Path, Path]], last: str = "") -> None:
-    """Move the content of folders into others of the same disk; the entry named `last` of each moves last.
+def publish(made: Path, folder: Path) -> None:
+    """Move the content of a folder into another of the same disk: files replace files, and folders folders.
 
-    A file replaces a file of the same name, and a folder a folder. Of two processes one waits for the other, so that
-    files of two results do not mix. Raises OSError; IsADirectoryError or NotADirectoryError, before anything moves,
-    where a folder meets a file.
+    Of two processes one waits for the other, so that files of two results do not mix. Raises OSError;
+    IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.
     """
-    with contextlib.ExitStack() as held:
-        for folder in sorted({real_path(folder) for _, folder in moves}):  # in one order: no process waits in a circle
-            held.enter_context(_alone_in(folder))
-        pieces = [
-            (path, folder / path.name)
-            for made, folder in moves
-            for path in sorted(made.iterdir(), key=lambda path: (path.name == last, path.name))
-        ]
+    with _alone_in(folder):
+        pieces = [(path, folder / path.name) for path in sorted(made.iterdir())]
         for path, target in pieces:
             if target.exists() and target.is_dir() != path.is_dir():
                 what = "a folder" if target.is_dir() else "not a folder"
@@ -170,7 +158,7 @@ def publish(moves: Sequence[tuple[Path, Path]], last: str = "") -> None:
                 raise OSError(number, f"this is {what} and will not be replaced", str(target))
         for path, target in pieces:
             if target.is_dir():
-                remove_folder(target, target.parent)
+                remove_folder(target, folder)
             os.replace(path, target)
 
 
@@ -198,7 +186,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def create_folders(folder: Path) -> list[Path]:
+def _create_folders(folder: Path) -> list[Path]:
     """Create `folder` and its missing parents; return the created ones, innermost first."""
     missing = []
     while not folder.exists():
@@ -207,13 +195,6 @@ def create_folders(folder: Path) -> list[Path]:
     for path in reversed(missing):
         path.mkdir(exist_ok=True)
     return missing
-
-
-def remove_empty(created: Sequence[Path]) -> None:
-    """Remove the created folders, unless they are in use."""
-    for path in created:
-        with contextlib.suppress(OSError):
-            path.rmdir()
 
 
 def _temporary_files(folder: Path) -> list[tuple[Path, re.Match[str]]]:

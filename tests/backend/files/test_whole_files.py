@@ -17,7 +17,6 @@ from primdiffusion.files.whole_files import (
     remove_of_process,
     replacing,
     staged,
-    staged_together,
     temporary_name,
     written_whole,
 )
@@ -53,13 +52,6 @@ def test_files_of_two_processes_that_publish_at_once_are_not_mixed(tmp_path):
     assert mixed(100, tmp_path) == 0
 
 
-def test_a_folder_named_twice_is_not_waited_for(tmp_path):
-    with staged_together([tmp_path, tmp_path]) as (one, two):
-        (one / "a").write_text("a")
-        (two / "b").write_text("b")
-    assert contents(tmp_path) == {"a": "a", "b": "b"}
-
-
 def test_no_file_is_written_through_a_link_out_of_the_folder(tmp_path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "out").mkdir()
@@ -82,24 +74,23 @@ def test_an_error_leaves_an_old_folder_as_it_was_and_no_new_one(tmp_path):
 
 
 def test_a_folder_in_place_of_one_file_keeps_all_others(tmp_path):
-    (tmp_path / "two" / "b").mkdir(parents=True)
-    (tmp_path / "two" / "a").write_text("kept")
+    (tmp_path / "b").mkdir(parents=True)
+    (tmp_path / "a").write_text("kept")
     with contextlib.ExitStack() as files:
-        for aside in files.enter_context(staged_together([tmp_path / "one", tmp_path / "two"])):
-            for name in "abc":
-                (aside / name).write_text("new")
+        aside = files.enter_context(staged(tmp_path))
+        for name in "abc":
+            (aside / name).write_text("new")
         with pytest.raises(IsADirectoryError) as error:
             files.close()
-    assert error.value.filename == str(tmp_path / "two" / "b")
-    assert contents(tmp_path) == {"two/a": "kept"}
-    assert not (tmp_path / "one").exists()
+    assert error.value.filename == str(tmp_path / "b")
+    assert contents(tmp_path) == {"a": "kept"}
 
 
 def test_a_folder_replaces_a_folder(tmp_path):
     for name in ("made/a", "made/b/x", "made/c", "old/a", "old/b/y"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
-    publish([(tmp_path / "made", tmp_path / "old")], last="a")
+    publish(tmp_path / "made", tmp_path / "old")
     assert contents(tmp_path / "old") == {"a": "made/a", "b/x": "made/b/x", "c": "made/c"}
 
 

@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.files.regular_files import FileError
-from blender_primdiffusion.files.whole_files import writer
+from blender_primdiffusion.files.whole_files import temporary_name
 from blender_primdiffusion.formats.camera_rig import Rig
 from blender_primdiffusion.formats.capture_layout import COMPLETE_FILE, LIST_FILE, RELEASED_REFERENCE, picture_path
 from blender_primdiffusion.formats.poses.motion import Motion
@@ -303,9 +303,9 @@ def test_links_where_the_reference_goes_lose_nothing_outside(tmp_path, monkeypat
     root = tmp_path / "captures"
     (root / "anna").mkdir(parents=True)
     (root / "anna" / "a").write_text("a")
-    space, _, rest = writer().split("-")
-    abandoned = root / f".{RELEASED_REFERENCE}.{space}-99999999-{rest}.partial"
+    abandoned = temporary_name(root / RELEASED_REFERENCE)
     abandoned.symlink_to(mine.parent)
+    os.utime(abandoned, (0, 0), follow_symlinks=False)
     (root / RELEASED_REFERENCE).symlink_to(mine.parent)
     _name_reference(root, "anna")
     assert (root / RELEASED_REFERENCE / "mine").read_text() == "mine"
