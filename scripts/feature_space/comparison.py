@@ -9,27 +9,37 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from primdiffusion.evaluation.distances import check_features, frechet_distance, kernel_distance
+from primdiffusion.evaluation.markdown import markdown_table
+from primdiffusion.people.assets import open_assets
+from primdiffusion.people.stored_people import find_people
+from primdiffusion.training.latents import split_people
 from torch import Tensor
 
-from primdiffusion.evaluation.attribute_network import (
-    AttributeNetwork,
-    features_of,
-    load_attribute_network,
+from scripts.feature_space.network import AttributeNetwork, features_of, load_attribute_network
+from scripts.feature_space.portraits import (
+    COLOURINGS,
+    Gallery,
+    Report,
+    Source,
+    mesh_sources,
+    open_gallery,
+    payload_sources,
+    read_seed,
+    silent,
 )
-from primdiffusion.evaluation.distances import (
-    Nearest,
-    frechet_distance,
-    frechet_uncertainty,
-    kernel_distance,
-    nearest,
-    precision_recall,
-)
-from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_gallery, silent
-from primdiffusion.evaluation.markdown import markdown_table
 
+NEIGHBOURS = 3
+"""k of precision and recall (Kynkäänniemi et al. 2019)."""
+REDRAWS = 20
+"""Bootstrap sets that the uncertainty of a distance is estimated from."""
+ROWS_AT_ONCE = 512
+"""Rows of a distance matrix computed at a time; limits memory, no effect on the result."""
 NETWORK_FILE = "features.safetensors"
 PORTRAITS_FOLDER = "portraits"
 DRAWS = 8
@@ -129,3 +139,80 @@ def table(rows: Mapping[str, Comparison]) -> str:
     """Format as a Markdown table, a row a set."""
     texts = [[name, *(f"{getattr(row, column):.4g}" for column in COLUMNS)] for name, row in rows.items()]
     return markdown_table(["people", *COLUMNS.values()], texts)
+
+
+def real_sources(people: Path, assets: Path | None, holdout: float, seed: int) -> tuple[list[Source], list[Source]]:
+    """Portraits of the people that a model was trained on, and of those held out: of payloads, or of `assets`' meshes.
+
+    Raises ValueError and FileNotFoundError for people or assets that are missing or unreadable.
+    """
+    split = split_people(find_people(people), holdout, seed)
+    if assets is None:
+        train, held = (payload_sources(paths) for paths in split)
+        return train, held
+    opened = open_assets(assets)
+    train, held = (mesh_sources(opened, [read_seed(path) for path in paths], COLOURINGS) for paths in split)
+    return train, held
+
+
+def frechet_uncertainty(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
+    """Standard deviation of the Frechet distance when other samples are drawn: over REDRAWS bootstrap sets of `first`.
+
+    A few samples far from the others move the distance by more than models differ.
+    """
+    generator = torch.Generator().manual_seed(0)
+    redrawn = [torch.randint(len(first), (len(first),), generator=generator) for _ in range(REDRAWS)]
+    return float(np.std([frechet_distance(first[chosen], second) for chosen in redrawn], ddof=1))
+
+
+class PrecisionRecall(NamedTuple):
+    """Fractions in [0, 1]; both are 1 for sets that cover each other."""
+
+    precision: float
+    """Fraction of generated samples within the real set."""
+    recall: float
+    """Fraction of real samples within the generated set."""
+
+
+def precision_recall(made: Float[Tensor, "n d"], real: Float[Tensor, "m d"]) -> PrecisionRecall:
+    """Improved precision and recall (Kynkäänniemi et al. 2019, eq. 1-2).
+
+    A set is the union of balls around its samples, each reaching to the nearest neighbour of number NEIGHBOURS in that
+    set. Raises ValueError for sets of as many or fewer.
+    """
+    check_features(made, real)
+    if min(len(made), len(real)) <= NEIGHBOURS:
+        raise ValueError(
+            f"sets of {len(made)} and {len(real)} samples are too small for {NEIGHBOURS} neighbours: use larger sets"
+        )
+
+    def covered(points: Tensor, centres: Tensor) -> float:
+        own = torch.cdist(centres, centres).kthvalue(NEIGHBOURS + 1, dim=1).values  # the nearest is the sample itself
+        return float((torch.cdist(points, centres) <= own).any(1).double().mean())
+
+    made, real = made.double(), real.double()
+    return PrecisionRecall(covered(made, real), covered(real, made))
+
+
+class Nearest(NamedTuple):
+    """The nearest neighbour of each query."""
+
+    distance: Float[Tensor, "q"]
+    index: Int[Tensor, "q"]
+
+
+def nearest(
+    queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"], left_out: Bool[Tensor, "q n"] | None = None
+) -> Nearest:
+    """Find Euclidean nearest neighbours, except pairs `left_out`.
+
+    Raises ValueError for an empty set or features of different widths.
+    """
+    if queries.shape[-1] != among.shape[-1] or not len(among):
+        raise ValueError(f"queries {tuple(queries.shape)} do not match the set {tuple(among.shape)}: same width, n > 0")
+    found = []
+    for first in range(0, len(queries), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        table = torch.cdist(queries[rows].double(), among.double())
+        found.append((table if left_out is None else table.masked_fill(left_out[rows], torch.inf)).min(1))
+    return Nearest(torch.cat([part.values for part in found]), torch.cat([part.indices for part in found]))
