@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import math
 from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple, TypeVar
 
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from primdiffusion.capture.reader import (
     Captures,
@@ -206,20 +205,10 @@ def stack(records: Sequence[Record]) -> Record:
     for field in dataclasses.fields(first):
         values = [getattr(record, field.name) for record in records]
         if isinstance(values[0], Tensor):
-            stacked[field.name] = _stacked(values)
+            stacked[field.name] = torch.stack(values)
         elif isinstance(values[0], TensorRecord):
             stacked[field.name] = stack(values)
     return dataclasses.replace(first, **stacked)
-
-
-def _stacked(values: Sequence[Tensor]) -> Tensor:
-    """Stack; in a worker, directly into shared memory, which saves a copy."""
-    if get_worker_info() is None:
-        return torch.stack(list(values))
-    shape = (len(values), *values[0].shape)
-    shared = values[0].untyped_storage()._new_shared(math.prod(shape) * values[0].element_size())
-    out = values[0].new_empty(0).set_(shared, 0, torch.Size(shape))  # type: ignore[call-overload]
-    return torch.stack(list(values), out=out)
 
 
 def _after(position: Position, samples: int, length: int) -> Position:

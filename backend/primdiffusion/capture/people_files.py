@@ -28,6 +28,8 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 LARGEST_GLB = 256 * 2**20
 MOST_PARTS, MOST_CORNERS, MOST_TEXELS = 100, 20_000_000, 2 * MOST_PIXELS
 """Limits of a human."""
+UNBACKED_CORNERS = 1_000_000
+"""Corners and vertices however small the file is; beyond, one for each byte: parts may share accessors."""
 LARGEST_UV = 1e4
 """Repeats of a texture."""
 SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
@@ -104,6 +106,7 @@ class _Glb:
         self.content: Any = parse_json(data[20 : 20 + size])
         self._binary, self._textures = data[28 + size :], {}
         self._texels = min(MOST_TEXELS, decoded_bytes(length) // 4)
+        self.most_corners = min(MOST_CORNERS, UNBACKED_CORNERS + length)
 
     def array(self, accessor: int) -> NDArray:
         """Values of an accessor, [count] or [count, width]."""
@@ -144,8 +147,9 @@ def _parts(glb: _Glb) -> tuple[TexturedPart, ...]:
     meshes = [(node["name"], glb.content["meshes"][node["mesh"]]["primitives"][0]) for node in nodes if "mesh" in node]
     if not 0 < len(meshes) <= MOST_PARTS:
         raise ValueError(f"it has {len(meshes)} parts, not 1 to {MOST_PARTS}")
-    if sum(accessors[primitive["indices"]]["count"] for _, primitive in meshes) > MOST_CORNERS:  # parts may share them
-        raise ValueError(f"it has more than {MOST_CORNERS} corners")
+    shown = [number for _, one in meshes for number in (one["indices"], one["attributes"]["POSITION"])]
+    if sum(accessors[number]["count"] for number in shown) > glb.most_corners:
+        raise ValueError(f"it has more than the {glb.most_corners} corners and vertices that its size allows")
     return tuple(_part(glb, str(name), primitive) for name, primitive in meshes)
 
 
@@ -154,7 +158,10 @@ def _part(glb: _Glb, name: str, primitive: Any) -> TexturedPart:
     vertices, uv = attributes["POSITION"].astype(np.float64), attributes["TEXCOORD_0"]
     index, weight = attributes["JOINTS_0"].astype(np.int32), attributes["WEIGHTS_0"].astype(np.float64)
     faces = glb.array(primitive["indices"]).reshape(-1, 3).astype(np.int64)
-    if not (faces < len(vertices)).all() or not (index < len(JOINT_NAMES)).all():
+    count = len(vertices)
+    if [array.shape for array in (vertices, uv, index, weight)] != [(count, width) for width in (3, 2, 4, 4)]:
+        raise ValueError(f"{name!r:.60} has not one position, texture coordinate, and four joints a vertex")
+    if not ((faces >= 0) & (faces < count)).all() or not ((index >= 0) & (index < len(JOINT_NAMES))).all():
         raise ValueError(f"{name!r:.60} has faces or joints that are not there")
     total = weight.sum(1, keepdims=True)
     weighted = (weight >= 0).all() and (total > 0).all() and (total < LARGEST_NUMBER).all()
@@ -164,7 +171,7 @@ def _part(glb: _Glb, name: str, primitive: Any) -> TexturedPart:
         name=name,
         vertices=vertices,
         faces=faces.astype(np.int32),
-        corner_uv=np.stack([uv[..., 0], 1 - uv[..., 1]], -1)[faces],  # glTF's v points down
+        corner_uv=np.stack([uv[..., 0], 1 - uv[..., 1]], -1)[faces].astype(np.float32),  # glTF's v points down
         texture=glb.texture(primitive["material"]),
         skin_index=index,
         skin_weight=weight / total,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from torch import Tensor
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import SUBJECT_NAME
 from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
-from primdiffusion.files.arrays import all_finite
 from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
@@ -282,35 +281,7 @@ def _read_views(folder: Path) -> list[View]:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
         raise FileError(path, f"cannot be read ({e!s:.160})", "render the subject again") from e
-    views = views_in(named, path, lambda camera: _size(folder, camera))
-    if not views:
-        raise FileError(path, "contains no camera", "render the subject again")
-    return views
-
-
-def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> list[View]:
-    """The cameras of {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}; `size` gives width and height by number.
-
-    Raises FileError, which names `path`, and what `size` raises.
-    """
-    views, name = [], ""
-    try:
-        for camera in range(len(named)):
-            name = f"camera{camera:04d}"
-            about = named[name]
-            k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
-            width, height = size(camera)
-            t = t.reshape(3)
-            if k.shape != (3, 3) or r.shape != (3, 3) or not all(map(all_finite, (k, r, t))):
-                raise ValueError("it is not finite, or its shapes are not K 3x3, R 3x3, T 3")
-            views.append(View(k, r, t, width, height))
-    except FileNotFoundError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
-        if isinstance(e, FileError):
-            raise
-        raise FileError(path, f"is not a list of cameras ({name}: {e!s:.160})", "render the subject again") from e
-    return views
+    return capture_layout.views_in(named, path, lambda camera: _size(folder, camera))
 
 
 def _size(folder: Path, camera: int) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
     root/dataset.json                              what the captures are: settings, axes, passes, names of parts
     root/release_human_list.txt                    one subject a line
-    root/annotations.json, root/images.csv         COCO annotations and a table of images: `captures coco`
+    root/annotations.json                          COCO annotations: `captures coco`
     root/composed/{id}/img/cameraNNNN/FFFF.jpg     of it: over backgrounds, or of several humans
     root/{id}/img/cameraNNNN/FFFF.jpg              sRGB over the background
     root/{id}/mask/cameraNNNN/FFFF.png             8 bits: share of the pixel that the person covers
@@ -28,16 +28,16 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.arrays import read_numbers
+from ..files.arrays import all_finite, read_numbers
 from ..files.json_files import parse_json, read_json
-from ..files.regular_files import FileError, read_regular, remove_file
+from ..files.regular_files import FileError, as_file_error, read_regular, remove_file
 from ..files.whole_files import write_atomically
 from .camera_rig import View
 
@@ -202,3 +202,21 @@ def write_cameras(subject: Path, views: Sequence[View]) -> None:
         for i, v in enumerate(views)
     }
     write_atomically(subject / "cameras.json", json.dumps(named, indent=1))
+
+
+def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> list[View]:
+    """The cameras of {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}; `size` gives width and height by number.
+
+    Raises FileError, which names `path`, and what `size` raises.
+    """
+    views = []
+    for number in range(len(named) if isinstance(named, dict) else 0):
+        name = f"camera{number:04d}"
+        with as_file_error(path, f"has no camera in {name}", "render the captures again"):
+            k, r, t = (np.asarray(named[name][key], np.float64) for key in "KRT")
+            if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(map(all_finite, (k, r, t))):
+                raise ValueError("it is not finite, or its shapes are not K 3x3, R 3x3, T 3")
+            views.append(View(k, r, t.reshape(3), *size(number)))
+    if not views:
+        raise FileError(path, "contains no camera", "render the captures again")
+    return views
