@@ -83,7 +83,7 @@ def main(options: Options) -> None:
             "people": {name: dataclasses.asdict(row) for name, row in rows.items()},
             "feature_accuracy": reference.network.card.get("accuracy", {}),
         }
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
+        options.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     print(table(rows))
     note = too_few_samples(options.count, *reference.held_features.shape)
     if note is not None:
