@@ -83,7 +83,7 @@ def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
 
 
-Report = Callable[[int, int], None]
+Report = Callable[[int, int], object]
 """Progress callback: done, total."""
 
 
