@@ -36,7 +36,7 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.coco import write_coco
-from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches, pack
+from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import Captures, Subject, open_captures
@@ -211,14 +211,7 @@ def _memory_growth_mb(folder: Path) -> float:
 def _loader_figures(folder: Path, seconds: float) -> dict[str, float]:
     """Views per second that one worker delivers to training, in batches of 2 samples of 4 + 4 views."""
     captures = open_captures(folder / "fast")
-    figures = {}
-    for kind in ("files", "packed"):
-        if kind == "packed":
-            list(pack(captures))
-        for size in (512, 256):
-            figures[f"loader_views_per_second_{kind}_{size}"] = _views_per_second(captures, size, seconds)
-    figures["loader_views_per_second"] = figures["loader_views_per_second_packed_512"]
-    return figures
+    return {f"loader_views_per_second_{size}": _views_per_second(captures, size, seconds) for size in (512, 256)}
 
 
 def _views_per_second(captures: Captures, size: int, seconds: float) -> float:

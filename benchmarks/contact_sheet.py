@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,6 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.gallery import PORTRAITS, camera_of
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
@@ -26,6 +26,9 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.march import march
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from scripts.feature_space.portraits import PORTRAITS, camera_of
 
 BACKGROUND = (0.72, 0.72, 0.72)
 LARGE = 512

@@ -18,6 +18,7 @@ samples, and of the models that benchmarks/tables.py compares.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -43,24 +44,7 @@ from neighbours import nearest_stored
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
-from primdiffusion.evaluation.gallery import (
-    COLOURINGS,
-    PORTRAITS,
-    Portrait,
-    camera_of,
-    made_gallery,
-    mesh_sources,
-)
-from primdiffusion.evaluation.generation import (
-    Comparison,
-    ReferenceSet,
-    compare,
-    open_reference_set,
-    real_vs_real,
-    table,
-)
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import place
@@ -73,6 +57,25 @@ from primdiffusion.training.latents import split_people
 from record import report, run
 from torch import Tensor
 from voxel_baseline import load_voxel_model
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from scripts.feature_space.comparison import (
+    Comparison,
+    ReferenceSet,
+    compare,
+    open_reference_set,
+    real_vs_real,
+    table,
+)
+from scripts.feature_space.network import features_of
+from scripts.feature_space.portraits import (
+    COLOURINGS,
+    PORTRAITS,
+    Portrait,
+    camera_of,
+    made_gallery,
+    mesh_sources,
+)
 
 Figures = dict[str, float | int | str | None]
 SPEED_FIGURES = (

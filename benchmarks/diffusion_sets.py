@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
-from primdiffusion.evaluation.gallery import PORTRAITS, camera_of
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
@@ -24,6 +24,9 @@ from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
 from torch import Tensor
 from voxel_baseline import VoxelModel, primitives_of, voxelise_payload
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from scripts.feature_space.portraits import PORTRAITS, camera_of
 
 TOGETHER = 8
 """Batch size of sampling."""

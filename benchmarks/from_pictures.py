@@ -40,6 +40,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -60,10 +61,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.evaluation.attribute_network import features_of, load_attribute_network
 from primdiffusion.evaluation.distances import cubic_kernel, kernel_distance
-from primdiffusion.evaluation.gallery import COLOURINGS, PORTRAITS, made_gallery, mesh_sources, open_gallery
-from primdiffusion.evaluation.generation import PORTRAITS_FOLDER
 from primdiffusion.evaluation.image_metrics import ssim
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
@@ -76,6 +74,11 @@ from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from record import command_line, report, run, surroundings
 from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from scripts.feature_space.comparison import PORTRAITS_FOLDER
+from scripts.feature_space.network import features_of, load_attribute_network
+from scripts.feature_space.portraits import COLOURINGS, PORTRAITS, made_gallery, mesh_sources, open_gallery
 
 SEED = 31_000_000
 """Seed of the first human; training sets count from 0."""

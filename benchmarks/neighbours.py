@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from primdiffusion.evaluation.gallery import Report, silent
 from primdiffusion.people.stored_people import read_person
 from primdiffusion.primitives.primitives import Payload
 from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from scripts.feature_space.portraits import Report, silent
 
 Encode = Callable[[Payload], Tensor]
 """Encodes a payload as a clean latent: `DiffusionModel.encode`."""

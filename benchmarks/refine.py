@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
-from primdiffusion.capture.people_files import find_people
+from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
@@ -33,14 +33,15 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
+from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.primitives.from_mesh import FULL_DENSITY
+from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.reconstruction.from_captures import reconstruct, targets_of
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from primdiffusion.runtime.device import best_device
-from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
+from primdiffusion.training.refine import bare_body, refine, view_psnr
 from record import command_line, report
 
 SEED = 30_000_000
@@ -79,7 +80,8 @@ def main() -> None:
         seen = CapturedPerson(name, 0, cameras, conditioning_views(captures, name, 0, cameras), betas, ())
         starts = {"encoder": reconstruct(load_encoder(), seen)}
         if not arguments.quick:
-            starts |= {"mesh": meshed_person(path), "body": bare_body(betas)}
+            mesh = from_mesh(read_person(path).mesh, rest_frames(betas.double().numpy()))
+            starts |= {"mesh": Human(mesh, betas, {}), "body": bare_body(betas)}
     figures, rows = {"refine_steps": steps}, []
     for source, start in starts.items():
         measured, refined = measure(start.to(best_device()), *sets, steps)
@@ -105,10 +107,10 @@ def measure(
     refine(start, given[:1], DescentSettings(steps=1))
     moments = []
 
-    def note(_: object) -> None:
+    def note() -> None:
         moments.append((time.perf_counter(), time.process_time()))
 
-    note(None)
+    note()
     refined = refine(start, given, DescentSettings(steps=steps), note).human
     figures = {
         "refine_psnr_start": mean_psnr(start, held),

@@ -70,7 +70,7 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("IoU of their masks", "captures", "mask_iou_fast_vs_cycles", ""),
         ("PSNR between them", "captures", "psnr_fast_vs_cycles", "dB"),
         ("largest error of a joint in the picture", "captures", "joint_reprojection_px_max", "px"),
-        ("packed views that the loader reads a second", "captures", "loader_views_per_second_packed_512", ""),
+        ("views that a worker of the loader reads a second", "captures", "loader_views_per_second_512", ""),
         ("a human fitted to its mesh, whole body", "chain", "payload_body_psnr", "dB"),
         ("the same after the codec", "chain", "codec_body_psnr", "dB"),
         ("cosine of fits to two sets of cameras", "chain", "payload_repeat_cosine", ""),

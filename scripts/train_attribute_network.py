@@ -1,4 +1,4 @@
-"""Train the feature network of `primdiffusion evaluate generation --people` on the people that a model was trained on.
+"""Train the network of scripts/feature_space on the people that a model was trained on.
 
     python -m scripts.train_attribute_network --reference DIR --people DIR [--assets DIR]
     python -m scripts.train_attribute_network --reference DIR --assets DIR --meshes 160
@@ -19,22 +19,17 @@ from typing import Any
 import torch
 import tyro
 from jaxtyping import Float, UInt8
-from primdiffusion.commands.evaluate import real_sources
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.evaluation.attribute_network import (
-    FEATURES,
-    AttributeNetwork,
-    detail_energies,
-    features_of,
-    load_attribute_network,
-)
-from primdiffusion.evaluation.gallery import COLOURINGS, PORTRAITS, Report, Source, mesh_sources, open_gallery, silent
-from primdiffusion.evaluation.generation import NETWORK_FILE, PORTRAITS_FOLDER
+from primdiffusion.evaluation.pose_depth_network import detail_energies
 from primdiffusion.files import tensor_file
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.people.assets import open_assets
 from torch import Tensor, nn
 from torch.nn import functional
+
+from scripts.feature_space.comparison import NETWORK_FILE, PORTRAITS_FOLDER, real_sources
+from scripts.feature_space.network import FEATURES, AttributeNetwork, features_of, load_attribute_network
+from scripts.feature_space.portraits import COLOURINGS, PORTRAITS, Report, Source, mesh_sources, open_gallery, silent
 
 CATEGORIES = ("sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat")
 SCALARS = ("skin_tone", "height")

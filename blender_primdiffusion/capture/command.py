@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
 
 from ..backend.child_process import stdin_has_ended
 from ..console import (
@@ -33,10 +32,10 @@ from ..console import (
     separate_stdout,
     stopped_by_signals,
 )
-from ..files.arrays import all_finite
 from ..files.json_files import read_json
 from ..files.regular_files import FileError, as_file_error, printable
 from ..formats.camera_rig import Rig, View
+from ..formats.capture_layout import views_in
 from ..formats.poses.files import ENDINGS
 from ..formats.requests import PASSES
 from .job import CaptureProgress, run
@@ -113,19 +112,9 @@ def _fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
-    """The cameras of a cameras.json, in the order of their names. Raises FileError or OSError."""
+    """The cameras of a cameras.json. Raises FileError or OSError."""
     with as_file_error(path, "holds no cameras as cameras.json has them", "render the captures again"):
-        named = read_json(path)
-        views = []
-        for name in sorted(named):
-            k, r, t = (np.array(named[name][key], np.float64) for key in "KRT")
-            if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(map(all_finite, (k, r, t))):
-                raise ValueError(f"{name} has no finite K [3, 3], R [3, 3] and T [3]")
-            with as_file_error(path, f"has no camera in {name}", "render the captures again"):
-                views.append(View(k, r, t.ravel(), width, height))
-        if not views:
-            raise ValueError("the list is empty")
-    return tuple(views)
+        return tuple(views_in(read_json(path), path, lambda _: (width, height)))
 
 
 def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:

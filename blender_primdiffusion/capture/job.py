@@ -23,13 +23,14 @@ from ..formats.capture_layout import (
     RELEASED_REFERENCE,
     claim,
     complete,
-    damage,
+    is_complete,
+    is_complete_view,
+    list_subjects,
     view_seed,
     write_cameras,
     write_joints,
     write_smpl,
 )
-from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.poses.files import read_motion
 from ..formats.poses.motion import Motion
 from ..formats.poses.skeleton import joint_positions
@@ -160,14 +161,12 @@ def _try_subject(
     folder, report = settings.out / scan_file.name, clock.report
     clock.begin(scan_file.name)
     views = places.frames * settings.camera_count
-    wrong = damage(folder, checksums=False)
-    if not wrong:
+    if is_complete(folder):
         report.skipped.append(scan_file.name)
         yield clock.skip_rest(views)
         return
     try:
         check_unlinked(folder)
-        remove_damaged(folder, wrong)
         yield from _capture(context, settings, scan_file, places.of(scan_file), body, load, clock)
         complete(folder)
         report.done.append(scan_file.name)

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
+from ..files.picture_files import depth_steps, normal_bytes, write_exr, write_png
 from ..files.regular_files import FileError, as_file_error, check_regular
 from ..files.whole_files import replacing
 from ..formats.capture_layout import picture_path
@@ -21,6 +21,7 @@ bpy.utils.expose_bundled_modules()
 import OpenImageIO  # noqa: E402  Blender's own, importable only after the line above
 
 JPEG_QUALITY = 95
+_JPEG_END = b"\xff\xd9"
 _ENVIRONMENT = "Environment"
 _NOTHING_M = 1e9
 """Cycles gives rays that hit nothing a depth of 1e10."""
@@ -141,7 +142,7 @@ def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
         sheet.file_format = "JPEG"
         with replacing(path) as partial:
             sheet.save(filepath=str(partial), quality=JPEG_QUALITY)
-            if not is_whole_picture(partial):  # on a full disk Blender saves what fits, and says nothing
+            if partial.read_bytes()[-2:] != _JPEG_END:  # on a full disk Blender saves what fits, and says nothing
                 raise OSError(errno.ENOSPC, "there is no room to write", str(path))
     except RuntimeError as error:
         raise OSError(f"{path} cannot be written ({error!s:.160}): is the disk full?") from error

@@ -95,6 +95,7 @@ def test_a_rigged_mesh_is_captured(command, tmp_path, empty_scene):
     assert done.returncode == DONE, done.stdout + done.stderr
     pictures = [path for path in out.rglob("*.png") if "img" in str(path) or "camera" in str(path)]
     assert pictures
+    assert (out / "anna" / "complete.json").is_file()
     (tmp_path / "file").write_text("")
     done = command("capture", "--people", tmp_path / "scans", "--out", tmp_path / "file" / "captures", *cheap)
     assert done.returncode == UNUSABLE

@@ -6,15 +6,14 @@ of primitives needs, so these come from a second file or from an automatic unwra
 
 from __future__ import annotations
 
-import os
-import pathlib
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, J
 from primdiffusion.files.arrays import all_finite, array_names, read_arrays, read_npy
-from primdiffusion.files.regular_files import FileContent, FileError, read_regular
+from primdiffusion.files.regular_files import FileError, check_regular, check_size, read_regular
 from primdiffusion.files.smpl_pickle import as_array, read_pickle
 from primdiffusion.runtime.failures import optional_package
 
@@ -36,14 +35,11 @@ _NO_XATLAS = (
 _ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
 """Encodings of "no parent": -1, or -1 converted to an unsigned integer."""
 
-Path = str | os.PathLike[str]
-Source = Path | FileContent
-
 
 def load_body(
-    path: Source, uv: Source | tuple[Source, Source] | None = None, shape_components: int = SHAPE_COMPONENTS
+    path: str | Path, uv: str | Path | tuple[Path, Path] | None = None, shape_components: int = SHAPE_COMPONENTS
 ) -> BodyModel:
-    """Load a body (float32) from an SMPL .pkl or .npz. Each file is opened once, or given as it was read before.
+    """Load a body (float32) from an SMPL .pkl or .npz.
 
     Args:
         path: the body model. Pickles are read by `smpl_pickle` and cannot run code.
@@ -57,9 +53,9 @@ def load_body(
         FileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range, or a pickle
             names a global that arrays do not need.
     """
-    if not isinstance(path, FileContent) and not pathlib.Path(path).is_file():
+    if not Path(path).is_file():
         raise FileNotFoundError(f"There is no body model at {path}; give the path of an SMPL .pkl or .npz file.")
-    arrays = _ArrayFile(read_body_file(path))
+    arrays = _ArrayFile(Path(path))
     template = arrays.real("v_template", ("V", 3))
     vertex_count = len(template)
     if np.abs(template).max() > LARGEST_BODY_M:
@@ -85,19 +81,15 @@ def load_body(
     )
 
 
-def read_body_file(path: Source) -> FileContent:
-    """Read a file of a body, or of its texture coordinates, once. Raises FileError and OSError."""
-    return path if isinstance(path, FileContent) else FileContent.read(os.fspath(path), LARGEST_BODY_FILE)
-
-
 class _ArrayFile:
     """Named arrays of one file, validated on access."""
 
-    def __init__(self, file: FileContent) -> None:
-        self.file, suffix = file, file.path.suffix
-        if suffix not in (".pkl", ".npz"):
-            raise FileError(file, f"ends in {suffix!r}, not in .pkl or .npz", "give a body model in SMPL's format")
-        self._pickled = read_pickle(file) if suffix == ".pkl" else None
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        if file.suffix not in (".pkl", ".npz"):
+            raise FileError(file, f"ends in {file.suffix!r}, not in .pkl or .npz", "give a body model in SMPL's format")
+        check_size(file, check_regular(file).st_size, LARGEST_BODY_FILE)
+        self._pickled = read_pickle(file, LARGEST_BODY_FILE) if file.suffix == ".pkl" else None
         self._names = set(array_names(file)) if self._pickled is None else set(self._pickled)
 
     def __contains__(self, name: str) -> bool:
@@ -161,13 +153,13 @@ def _parents(arrays: _ArrayFile) -> np.ndarray:
 
 
 def _texture_coordinates(
-    arrays: _ArrayFile, uv: Source | tuple[Source, Source] | None, template: np.ndarray, faces: np.ndarray
+    arrays: _ArrayFile, uv: str | Path | tuple[Path, Path] | None, template: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    given = () if uv is None else tuple(map(read_body_file, uv if isinstance(uv, tuple) else (uv,)))
-    source: FileContent | str = given[-1] if given else arrays.file
+    given = () if uv is None else tuple(map(Path, uv if isinstance(uv, tuple) else (uv,)))
+    source: Path | str = given[-1] if given else arrays.file
     if len(given) == 2:
         coordinates, coordinate_faces = map(_numpy_file, given)
-    elif given and given[0].path.suffix == ".npz":
+    elif given and given[0].suffix == ".npz":
         held = _ArrayFile(given[0])
         coordinates, coordinate_faces = held.raw("vt"), held.raw("ft")
     elif given:
@@ -176,7 +168,7 @@ def _texture_coordinates(
         coordinates, coordinate_faces = arrays.raw("vt"), arrays.raw("ft")
     else:
         coordinate_faces, coordinates = _unwrapped(template, faces)
-        source = f"the automatic unwrap of {arrays.file.path.name}"
+        source = f"the automatic unwrap of {arrays.file.name}"
     numbers = coordinates.dtype.kind in "iuf" and coordinate_faces.dtype.kind in "iuf"
     if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise FileError(
@@ -200,14 +192,14 @@ def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
     return coordinate_faces, coordinates
 
 
-def _numpy_file(file: FileContent) -> np.ndarray:
+def _numpy_file(file: Path) -> np.ndarray:
     array = read_npy(file)
     if array.dtype.kind not in "iuf":
         raise FileError(file, "does not hold one array of numbers", "give the pair (vt.npy, ft.npy)")
     return array
 
 
-def _obj_texture_coordinates(file: FileContent, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _obj_texture_coordinates(file: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Read texture coordinates from an OBJ with the body's triangles, in any order."""
     coordinates: list[list[float]] = []
     corner_of_face: dict[frozenset[int], dict[int, int]] = {}

@@ -1,7 +1,7 @@
-"""Annotations of finished captures in COCO's format, for trainers of keypoints and masks, and a table of all images.
+"""Annotations of finished captures in COCO's format, for trainers of keypoints and masks.
 
-    root/annotations.json    images, persons with boxes, run-length masks and COCO's 17 keypoints; cameras and SMPL too
-    root/images.csv          a line for each human in an image: subject, frame, camera, attributes where they are known
+    root/annotations.json    images, persons with boxes, run-length masks and COCO's 17 keypoints; cameras, SMPL and
+                             attributes too
     root/composed/           images over backgrounds, if pictures for them are given, and of humans who stand together
 
 Each human is captured alone; annotations put those who stand together into one image, so that one who is partly hidden
@@ -12,7 +12,6 @@ All follow from the files of the captures (and these pictures) alone, so that th
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
 import json
@@ -31,13 +30,13 @@ from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_from_body, joints_of
 from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.files.regular_files import FileError
-from primdiffusion.files.whole_files import staged
+from primdiffusion.files.whole_files import replacing
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.joints import JOINT_NAMES
 
-ANNOTATIONS_FILE, TABLE_FILE = "annotations.json", "images.csv"
+ANNOTATIONS_FILE = "annotations.json"
 PASSES = ("img", "mask", "depth")
 """Passes that annotations need."""
 THRESHOLD = 128
@@ -77,7 +76,7 @@ def write_coco(
     backgrounds: Backgrounds | None = None,
     report: Callable[[str], object] = lambda subject: None,
 ) -> None:
-    """Write annotations.json and images.csv into the captures' folder; both appear at the end or not at all.
+    """Write annotations.json into the captures' folder; it appears at the end or not at all.
 
     With backgrounds, and of humans who stand together (`groups`), composed images are written, which are annotated.
 
@@ -87,27 +86,23 @@ def write_coco(
 
     Args:
         captures: images, masks and depth of finished subjects.
-        attributes: values for the table by subject and name; a subject may lack all or some.
+        attributes: values by subject and name; a subject may lack all or some.
         backgrounds: pictures to draw from for each view; without them, annotated images are those of the captures.
         report: called with the name of each annotated subject.
 
     Raises:
         FileNotFoundError, FileError: a pass or file is missing, or damaged.
-        ValueError: attributes of a subject are not a mapping.
         FileError, OSError: a file cannot be written, or lies behind a link out of the captures.
     """
     if missing := [kind for kind in PASSES if kind not in captures.passes]:
         raise FileError(captures.root, f"has no {' and no '.join(missing)}", f"render with {', '.join(PASSES)}")
-    with staged(captures.root) as folder:
-        with (folder / TABLE_FILE).open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(_rows(captures, attributes, backgrounds))
-        with (folder / ANNOTATIONS_FILE).open("w", encoding="utf-8", newline="\n") as file:
-            file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
-            file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
-            file.writelines(_separated(_line(image.record) for image in _images(captures, backgrounds)))
-            file.write('],\n"annotations":[\n')
-            file.writelines(_separated(_annotations(captures, backgrounds, report)))
-            file.write("]}\n")
+    with replacing(captures.root / ANNOTATIONS_FILE) as path, path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
+        file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
+        file.writelines(_separated(_line(image.record) for image in _images(captures, backgrounds)))
+        file.write('],\n"annotations":[\n')
+        file.writelines(_separated(_annotations(captures, attributes, backgrounds, report)))
+        file.write("]}\n")
 
 
 def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
@@ -313,33 +308,25 @@ def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Im
                 yield _Image(number, subjects, frame, camera, background, kind)
 
 
-def _annotations(captures: Captures, backgrounds: Backgrounds | None, report: Callable[[str], object]) -> Iterator[str]:
+def _annotations(
+    captures: Captures,
+    attributes: Mapping[str, Mapping[str, Any]],
+    backgrounds: Backgrounds | None,
+    report: Callable[[str], object],
+) -> Iterator[str]:
     number, points = 0, []
     for image in _images(captures, backgrounds):
         if image.frame == image.camera == 0:
             points = [keypoints_of(subject) for subject in image.subjects]
         for annotation in image.annotations(points):
             number += 1
-            yield _line({"id": number, "image_id": image.id, "category_id": CATEGORY["id"], **annotation})
+            about = {"id": number, "image_id": image.id, "category_id": CATEGORY["id"]}
+            own = attributes.get(annotation["subject"])
+            yield _line({**about, **annotation, **({} if own is None else {"attributes": own})})
         first = image.subjects[0]
         if (image.frame, image.camera) == (first.frames - 1, len(first.views) - 1):
             for subject in image.subjects:
                 report(subject.name)
-
-
-def _rows(
-    captures: Captures, attributes: Mapping[str, Mapping[str, Any]], backgrounds: Backgrounds | None
-) -> Iterator[list[Any]]:
-    for name in captures.subjects:
-        if not isinstance(attributes.get(name, {}), Mapping):
-            raise ValueError(f"the attributes of {name} are {attributes[name]!r:.80}: give names and values")
-    columns = sorted({column for name in captures.subjects for column in attributes.get(name, {})})
-    yield ["image_id", "file_name", "subject", "frame", "camera", *columns]
-    for image in _images(captures, backgrounds):
-        for subject in image.subjects:
-            own = attributes.get(subject.name, {})
-            values = [own.get(column, "") for column in columns]
-            yield [image.id, image.file_name, subject.name, image.frame, image.camera, *values]
 
 
 def _rounded(values: np.ndarray, digits: int) -> list[Any]:

@@ -2,29 +2,20 @@
 
 A sample follows from (seed, epoch, index) alone: batches do not depend on the number of workers, and training resumes
 from a `Position` exactly.
-
-Images may be packed into one array per subject, which is memory-mapped and needs no decoding:
-
-root/packed/{id}.npy     uint8 [F, C, H, W, 4]: sRGB over black, and the mask
-root/packed/{id}.json    digest of the source images; an outdated pack is ignored
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
-import hashlib
-import json
-import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Float32, Int64
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from primdiffusion.capture.reader import (
     Captures,
@@ -36,97 +27,10 @@ from primdiffusion.capture.reader import (
     resample,
     windowed_view,
 )
-from primdiffusion.files.arrays import map_npy
-from primdiffusion.files.json_files import LARGEST_BYTES, read_json
-from primdiffusion.files.regular_files import FileError, read_regular
-from primdiffusion.files.whole_files import replacing, write_atomically
-from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.requests import Count
 from primdiffusion.formats.schema import Checked
 from primdiffusion.geometry.records import TensorRecord
-
-PACK_FOLDER, PACK_FORMAT, PACK_VERSION = "packed", "primdiffusion-packed-captures", 1
-
-
-@dataclasses.dataclass(frozen=True)
-class Packing:
-    """The result of packing one subject."""
-
-    subject: str
-    found: bool
-    """Whether a pack of the same images existed."""
-    gigabytes: float
-
-
-def pack(captures: Captures) -> Iterator[Packing]:
-    """Pack all subjects that have no current pack; yields each when its array is complete.
-
-    Raises:
-        FileNotFoundError, FileError: an image is missing or damaged, or cameras differ in size.
-        OSError: a file cannot be written.
-    """
-    for name in captures.subjects:
-        subject = captures.subject(name)
-        found = open_pack(subject) is not None
-        if not found:
-            pack_subject(subject)
-        yield Packing(name, found, pack_path(subject).stat().st_size / 1e9)
-
-
-def pack_subject(subject: Subject) -> None:
-    """Write one subject's array. Raises as `pack` does."""
-    sizes = {(view.height, view.width) for view in subject.views}
-    if len(sizes) != 1:
-        raise FileError(
-            subject.folder, "has images of several sizes, which cannot be packed", "render it with one size"
-        )
-    stamp = source_stamp(subject)
-    shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
-    whole = replacing(pack_path(subject), subject.folder.parent)
-    with whole as path, path.open("wb") as file:  # a full disk kills a writer of mapped memory
-        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        for frame in range(shape[0]):
-            for camera in range(shape[1]):
-                file.write(subject.rgba(frame, camera).data)
-    about = {"format": PACK_FORMAT, "version": PACK_VERSION, "source": stamp}
-    write_atomically(pack_path(subject).with_suffix(".json"), json.dumps(about))
-
-
-def open_pack(subject: Subject) -> UInt8[np.ndarray, "F C H W 4"] | None:
-    """A subject's memory-mapped array; None if there is none or the images have changed since."""
-    path = pack_path(subject)
-    try:
-        about = read_json(path.with_suffix(".json"))
-        if about != {"format": PACK_FORMAT, "version": PACK_VERSION, "source": source_stamp(subject)}:
-            return None
-        array = map_npy(path)
-    except (OSError, ValueError, EOFError):
-        return None
-    view = subject.views[0]
-    wanted = (subject.frames, len(subject.views), view.height, view.width, 4)
-    return array if array.dtype == np.uint8 and array.shape == wanted else None
-
-
-def pack_path(subject: Subject) -> Path:
-    """Path of a subject's array."""
-    return subject.folder.parent / PACK_FOLDER / f"{subject.name}.npy"
-
-
-def source_stamp(subject: Subject) -> str:
-    """Digest that changes with the images: of the completion mark, else of all names, sizes and modification times."""
-    digest = hashlib.sha256()
-    mark = subject.folder / capture_layout.COMPLETE_FILE
-    if mark.is_file():
-        digest.update(read_regular(mark, LARGEST_BYTES))
-    else:
-        for path in sorted(p for kind in ("img", "mask") for p in (subject.folder / kind).rglob("*.*")):
-            about = path.stat()
-            name = path.relative_to(subject.folder).as_posix()
-            digest.update(f"{name} {about.st_size} {about.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
-
 
 Record = TypeVar("Record", bound=TensorRecord)
 
@@ -198,7 +102,6 @@ class CaptureDataset(SampleSet[TrainingSample]):
         frames = captures.about.get("frames")
         counts = [frames or captures.subject(name).frames for name in captures.subjects]
         self._pairs = np.array([(s, f) for s, count in enumerate(counts) for f in range(count)], np.int64)
-        self._packs: dict[str, np.ndarray | None] = {}
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
 
     def __len__(self) -> int:
@@ -242,21 +145,9 @@ class CaptureDataset(SampleSet[TrainingSample]):
     def _framed(
         self, subject: Subject, frame: int, camera: int, crops: np.random.Generator | None
     ) -> tuple[np.ndarray, View]:
-        rgba, view, size = self._rgba(subject, frame, camera), subject.views[camera], self.settings.size
+        rgba, view, size = subject.rgba(frame, camera), subject.views[camera], self.settings.size
         window = full_window(view) if crops is None else _crop_around_subject(rgba, size, crops)
         return resample(rgba, window, size), windowed_view(view, window, size)
-
-    def _rgba(self, subject: Subject, frame: int, camera: int) -> np.ndarray:
-        if subject.name not in self._packs:
-            self._packs[subject.name] = open_pack(subject)
-        packed = self._packs[subject.name]
-        if packed is not None:
-            return np.asarray(packed[frame, camera])
-        return subject.rgba(frame, camera)
-
-    def __getstate__(self) -> dict[str, object]:
-        """Worker processes open the packs themselves."""
-        return {**self.__dict__, "_packs": {}}
 
 
 class _Order(Sampler[Position]):
@@ -314,20 +205,10 @@ def stack(records: Sequence[Record]) -> Record:
     for field in dataclasses.fields(first):
         values = [getattr(record, field.name) for record in records]
         if isinstance(values[0], Tensor):
-            stacked[field.name] = _stacked(values)
+            stacked[field.name] = torch.stack(values)
         elif isinstance(values[0], TensorRecord):
             stacked[field.name] = stack(values)
     return dataclasses.replace(first, **stacked)
-
-
-def _stacked(values: Sequence[Tensor]) -> Tensor:
-    """Stack; in a worker, directly into shared memory, which saves a copy."""
-    if get_worker_info() is None:
-        return torch.stack(list(values))
-    shape = (len(values), *values[0].shape)
-    shared = values[0].untyped_storage()._new_shared(math.prod(shape) * values[0].element_size())
-    out = values[0].new_empty(0).set_(shared, 0, torch.Size(shape))  # type: ignore[call-overload]
-    return torch.stack(list(values), out=out)
 
 
 def _after(position: Position, samples: int, length: int) -> Position:

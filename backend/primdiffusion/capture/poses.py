@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.body.pose_file import read_motion
-from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.poses.built_in import built_in_vectors
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
@@ -23,17 +20,6 @@ def built_in_poses() -> BodyPose:
     """All built-in poses, the near-T pose first: rotations [20, 24, 3, 3]."""
     turns = torch.from_numpy(np.array(list(built_in_vectors().values())))
     return BodyPose(axis_angle_to_matrix(turns).float(), torch.zeros(len(turns), 3))
-
-
-def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
-    """Read motion files; return the motions, and an error message for each unreadable file."""
-    motions, failures = [], []
-    for path in paths:
-        try:
-            motions.append(read_motion(path))
-        except (FileNotFoundError, FileError) as e:
-            failures.append(str(e))
-    return motions, failures
 
 
 def turned(poses: BodyPose, yaw: Float[np.ndarray, "F"]) -> BodyPose:

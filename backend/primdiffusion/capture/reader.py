@@ -4,36 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import SUBJECT_NAME
 from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
-from primdiffusion.files.arrays import all_finite
 from primdiffusion.files.json_files import read_json
-from primdiffusion.files.picture_files import DEPTH_UNIT
-from primdiffusion.files.regular_files import FileError, open_regular
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.pictures import (
-    LARGEST_FILE,
     decoded,
-    decoded_bytes,
     is_indexed,
     label_values,
     opened_picture,
-    strips,
 )
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
@@ -107,8 +101,6 @@ CAMERAS_FILE = "cameras.json"
 PASSES_OF_RELEASED = ("img", "mask")
 FAINTEST = 32
 """Share of 255 below which a mask's values are labels: no view of a person is covered that little."""
-VIEW_OF_FILES = 2
-"""Times of what the largest of its files may take alone (`decoded_bytes`) that all passes of a view may take."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,12 +113,6 @@ class Views(TensorRecord):
     """A batch of views [*b, v]."""
     pose: BodyPose
     """[*b]."""
-    depth: Float32[Tensor, "*b v H W"] | None = None
-    """Metres along the optical axis; 0 for background."""
-    normal: Float32[Tensor, "*b v H W 3"] | None = None
-    """World space; 0 for background."""
-    part: UInt8[Tensor, "*b v H W"] | None = None
-    """1 + the joint with the largest skin weight; 0 for background."""
 
     @property
     def image(self) -> UInt8[Tensor, "*b v H W 3"]:
@@ -166,31 +152,20 @@ class Subject:
         return self.pictures((kind,), frame, camera)[kind]
 
     def pictures(self, kinds: Sequence[str], frame: int, camera: int) -> dict[str, np.ndarray]:
-        """The stored values of image files of one view, which are limited together before any is decoded.
+        """The stored values of image files of one view.
 
         Raises:
             FileNotFoundError: a file is missing.
-            FileError: one is damaged, its size is not the camera's, or all are too large for their files.
+            FileError: one is damaged, or its size is not the camera's.
         """
         view = self.views[camera]
         paths = {kind: capture_layout.picture_path(self.folder, kind, camera, frame) for kind in kinds}
-        with contextlib.ExitStack() as stack:
-            files = {kind: stack.enter_context(_opened(path)) for kind, path in paths.items()}
-            self._check_together(files, view)
-            return {kind: _read(file, paths[kind], kind, view.width, view.height) for kind, file in files.items()}
+        return {kind: _read(path, kind, view.width, view.height) for kind, path in paths.items()}
 
     def rgba(self, frame: int, camera: int) -> UInt8[np.ndarray, "H W 4"]:
         """Colour and mask of a view. Raises as `pictures`."""
         found = self.pictures(("img", "mask"), frame, camera)
         return np.concatenate([found["img"], found["mask"][..., None]], axis=-1)
-
-    def _check_together(self, files: Mapping[str, BinaryIO], view: View) -> None:
-        largest = max((file.seek(0, os.SEEK_END) for file in files.values()), default=0)
-        claimed = view.width * view.height * sum(_BYTES_OF_A_PIXEL.get(kind, 4) for kind in files)
-        if claimed > VIEW_OF_FILES * decoded_bytes(largest):
-            claim = f"{len(files)} images of {view.width} x {view.height} pixels of one view"
-            given = f"files of at most {largest} bytes"
-            raise FileError(self.folder, f"has {claim}, in {given}", "render the subject again, smaller")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -222,29 +197,6 @@ class Captures:
             folder = self.root / name
             self._read[name] = Subject(folder, tuple(_read_views(folder)), read_smpl(folder))
         return self._read[name]
-
-    def view(self, subject: str, frame: int, camera: int) -> Views:
-        """One image with all its passes, without a dimension v.
-
-        Raises:
-            KeyError, IndexError: there is no such subject, frame or camera.
-            FileNotFoundError, FileError: a file is missing or damaged.
-        """
-        person = self.subject(subject)
-        if not (0 <= frame < person.frames and 0 <= camera < len(person.views)):
-            raise IndexError(
-                f"{subject} has {person.frames} frames and {len(person.views)} cameras, not frame {frame} of camera "
-                f"{camera}"
-            )
-        known = [kind for kind in self.passes if isinstance(kind, str) and kind in _KINDS]
-        pictures = person.pictures(known, frame, camera)
-        values = {kind: torch.from_numpy(_KINDS[kind](pictures.pop(kind))) for kind in known}  # one by one: less memory
-        view = person.views[camera]
-        size = (view.height, view.width)
-        image = values.pop("img", torch.zeros(*size, 3, dtype=torch.uint8))
-        mask = values.pop("mask", torch.full(size, 255, dtype=torch.uint8))
-        rgba = torch.cat([image, mask[..., None]], dim=-1)
-        return Views(rgba, person.camera(camera), person.smpl.pose(frame), **values)
 
 
 def open_captures(root: str | Path) -> Captures:
@@ -283,22 +235,17 @@ def as_camera(view: View) -> Camera:
     )
 
 
-def _opened(path: Path) -> BinaryIO:
-    with _named(path):
-        return open_regular(path, LARGEST_FILE)
-
-
-def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.ndarray:
+def _read(path: Path, kind: str, width: int, height: int) -> np.ndarray:
     """Read an image: [H, W, 3] uint8 for img and normal, [H, W] uint8 for mask and part, uint16 for depth.
 
     Raises FileError for a damaged file, or one of another size.
     """
-    with _named(path), opened_picture(file, bytes_each=_BYTES_OF_A_PIXEL.get(kind, 4)) as picture:
+    with _named(path), opened_picture(path, bytes_each=4 if kind in ("img", "normal") else 1) as picture:
         size = picture.size
         if size == (width, height) and kind == "depth":
             if len(picture.getbands()) != 1:
                 raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
-            return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
+            return np.asarray(picture).astype(np.uint16)
         if size == (width, height) and kind == "mask":
             return _coverage(picture)
         if size == (width, height):
@@ -334,35 +281,7 @@ def _read_views(folder: Path) -> list[View]:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
         raise FileError(path, f"cannot be read ({e!s:.160})", "render the subject again") from e
-    views = views_in(named, path, lambda camera: _size(folder, camera))
-    if not views:
-        raise FileError(path, "contains no camera", "render the subject again")
-    return views
-
-
-def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> list[View]:
-    """The cameras of {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}; `size` gives width and height by number.
-
-    Raises FileError, which names `path`, and what `size` raises.
-    """
-    views, name = [], ""
-    try:
-        for camera in range(len(named)):
-            name = f"camera{camera:04d}"
-            about = named[name]
-            k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
-            width, height = size(camera)
-            t = t.reshape(3)
-            if k.shape != (3, 3) or r.shape != (3, 3) or not all(map(all_finite, (k, r, t))):
-                raise ValueError("it is not finite, or its shapes are not K 3x3, R 3x3, T 3")
-            views.append(View(k, r, t, width, height))
-    except FileNotFoundError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
-        if isinstance(e, FileError):
-            raise
-        raise FileError(path, f"is not a list of cameras ({name}: {e!s:.160})", "render the subject again") from e
-    return views
+    return capture_layout.views_in(named, path, lambda camera: _size(folder, camera))
 
 
 def _size(folder: Path, camera: int) -> tuple[int, int]:
@@ -376,22 +295,3 @@ def _size(folder: Path, camera: int) -> tuple[int, int]:
             except (OSError, ValueError) as e:
                 raise FileError(path, f"is not a complete image ({e!s:.160})", "render it again") from e
     raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")
-
-
-def _depth(steps: np.ndarray) -> np.ndarray:
-    metres = steps.astype(np.float32)
-    metres *= np.float32(DEPTH_UNIT)
-    return metres
-
-
-def _normal(values: np.ndarray) -> np.ndarray:
-    normals = np.zeros(values.shape, np.float32)
-    for row, bytes_of_row in zip(normals, values, strict=True):  # whole pictures would take three copies
-        covered = bytes_of_row.any(-1)
-        row[covered] = bytes_of_row[covered].astype(np.float32) / 127.5 - 1
-    return normals
-
-
-_BYTES_OF_A_PIXEL = {"img": 4, "mask": 1, "depth": 4, "normal": 12, "part": 1}
-"""Of a view in memory."""
-_KINDS = {"img": np.asarray, "mask": np.asarray, "depth": _depth, "normal": _normal, "part": np.asarray}

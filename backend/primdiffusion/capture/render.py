@@ -5,12 +5,10 @@ Textured meshes are drawn by the rasteriser; whatever is a `Renderable` can be c
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
 import dataclasses
 import json
 import math
-import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -28,7 +26,6 @@ from primdiffusion.files.regular_files import check_unlinked
 from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
-from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.group_places import extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
@@ -37,7 +34,7 @@ from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.rasterise import Draw
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.runtime.failures import describe
-from primdiffusion.runtime.worker_process import begin_worker
+from primdiffusion.runtime.worker_process import each
 
 JPEG_QUALITY = 95
 
@@ -166,7 +163,7 @@ def render_frames(
     for frame in frames:
         draw = None
         for camera, view in enumerate(setup.views):
-            if not is_complete_view(subject, passes, camera, frame):
+            if not capture_layout.is_complete_view(subject, passes, camera, frame):
                 draw = draw or setup.person.posed(setup.skinning[frame])
                 write_view(subject, passes, camera, frame, draw(view, samples))
             yield frame, camera
@@ -216,8 +213,6 @@ class RenderJob:
     seed: int = 0
     released_reference: bool = False
     """Whether the dataset includes the subject whose name the released code looks up for rest sizes."""
-    unread_poses: tuple[str, ...] = ()
-    """Errors of skipped pose files, for the report."""
     together: tuple[Mapping[str, Path], ...] = ()
     """Groups of humans who stand together, files by name; every subject is in one of them, or there are none."""
     read: Callable[[Path], Renderable] = read_person
@@ -261,11 +256,11 @@ class SubjectResult:
 def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
     """Render all subjects; yields the result of each. A failed subject does not stop the others.
 
-    A subject is skipped if it has a complete.json and all its files have the sizes listed there.
+    A subject is skipped if it has a complete.json, and a view if all its images exist.
 
     Raises:
         FileError: the folder contains something else.
-        ValueError: a pass is unknown, or workers is less than 1.
+        ValueError: a pass is unknown, workers is less than 1, or a worker was killed.
         OSError: the folder cannot be written.
     """
     possible = (*PASSES, FLOAT_DEPTH)
@@ -274,61 +269,29 @@ def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
     if workers < 1:
         raise ValueError(f"workers is {workers}: give 1 or more")
     capture_layout.claim(job.out, job.about)
-    outcomes: list[SubjectResult] = []
-    for outcome in _outcomes(job, workers):
+    outcomes, waiting = [], []
+    for name in job.people:
+        if capture_layout.is_complete(job.out / name):
+            outcomes.append(SubjectResult(name, "skipped"))
+            yield outcomes[-1]
+        else:
+            waiting.append((job, name))
+    for outcome in each(_render_subject, waiting, workers):
         outcomes.append(outcome)
         _write_report(job, outcomes)
         yield outcome
     _write_report(job, outcomes)
 
 
-def _outcomes(job: RenderJob, workers: int) -> Iterator[SubjectResult]:
-    waiting = []
-    for name in job.people:
-        if capture_layout.damage(job.out / name, checksums=False):
-            waiting.append(name)
-        else:
-            yield SubjectResult(name, "skipped")
-    shares = _shares(len(job.poses.translation), math.ceil(workers / max(len(waiting), 1)))
-    if workers == 1:
-        for name in waiting:
-            yield _finish(job, name, [_try(job, name, share) for share in shares])
-        return
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, context, begin_worker) as pool:
-        tasks = {pool.submit(_try, job, name, share): name for name in waiting for share in shares}
-        results: dict[str, list[SubjectResult]] = {name: [] for name in waiting}
-        try:
-            for task in concurrent.futures.as_completed(tasks):
-                name = tasks[task]
-                results[name].append(_result(task, name))
-                if len(results[name]) == len(shares):
-                    yield _finish(job, name, results[name])
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _shares(frames: int, parts: int) -> list[range]:
-    """Split the frames of a subject among workers, so that few subjects use many cores."""
-    size = math.ceil(frames / max(1, min(parts, frames)))
-    return [range(first, min(first + size, frames)) for first in range(0, frames, size)]
-
-
-def _result(task: concurrent.futures.Future[SubjectResult], name: str) -> SubjectResult:
-    try:
-        return task.result()
-    except concurrent.futures.process.BrokenProcessPool:
-        return SubjectResult(name, "failed", "a worker process was killed: run the same command again to resume")
-
-
-def _try(job: RenderJob, name: str, frames: Sequence[int]) -> SubjectResult:
-    """Render some frames of a subject; errors of input and files become a failed result."""
+def _render_subject(job: RenderJob, name: str) -> SubjectResult:
+    """Render what is missing of a subject; errors of input and files become a failed result."""
     try:
         setup = _set_up(job, name)
         check_unlinked(job.out / name)
-        if frames[0] == 0:
-            write_parameters(job.out / name, setup)
+        write_parameters(job.out / name, setup)
+        frames = range(len(setup.skinning))
         views = sum(1 for _ in render_frames(job.out / name, setup, frames, job.passes, job.samples))
+        capture_layout.complete(job.out / name)
         return SubjectResult(name, "done", views=views)
     except Exception as e:
         failure = describe(e)
@@ -346,21 +309,12 @@ def _set_up(job: RenderJob, name: str) -> CaptureSetup:
     return set_up_together([job.read(group[n]) for n in names], names.index(name), job.poses, job.rig, rng)
 
 
-def _finish(job: RenderJob, name: str, outcomes: Sequence[SubjectResult]) -> SubjectResult:
-    failed = next((outcome for outcome in outcomes if outcome.status == "failed"), None)
-    if failed is not None:
-        return failed
-    capture_layout.complete(job.out / name)
-    return SubjectResult(name, "done", views=sum(outcome.views for outcome in outcomes))
-
-
 def _write_report(job: RenderJob, outcomes: Sequence[SubjectResult]) -> None:
     """Write the list of finished subjects and the report."""
-    list_subjects(job.out)
+    capture_layout.list_subjects(job.out)
     report = {
         "done": [outcome.subject for outcome in outcomes if outcome.status == "done"],
-        "failed": [{"subject": "", "what": "poses", "why": error} for error in job.unread_poses]
-        + [
+        "failed": [
             {"subject": outcome.subject, "what": "render", "why": outcome.error}
             for outcome in outcomes
             if outcome.status == "failed"

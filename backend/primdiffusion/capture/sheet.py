@@ -19,8 +19,8 @@ from primdiffusion.formats.camera_rig import View
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
 
 
-def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int) -> float:
-    """Write the sheet, one subject in one pose per row; return their largest `reprojection_error`, pixels.
+def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int) -> None:
+    """Write the sheet, one subject in one pose per row.
 
     Rows cycle through the poses; every other image has the joints drawn on it.
 
@@ -30,9 +30,8 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
     """
     if min(rows, columns, size) < 1:
         raise ValueError(f"rows, columns and size are {rows}, {columns} and {size}: give 1 or more")
-    chosen = _chosen(captures, rows)
     lines = []
-    for name, frame in chosen:
+    for name, frame in _chosen(captures, rows):
         subject = captures.subject(name)
         joints = joints_of(subject)[frame]
         cameras = _evenly(len(subject.views), columns)
@@ -48,7 +47,6 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
             left += picture.width
     with replacing(out) as path:
         sheet.save(path, format="PNG")
-    return max(reprojection_error(captures.subject(name)) for name in {name for name, _ in chosen})
 
 
 def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarray, "F J 3"]:
@@ -87,28 +85,6 @@ def body_joints(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]
     smpl = subject.smpl
     pose = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
     return body.shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
-
-
-def reprojection_error(subject: Subject) -> float:
-    """Largest distance between the image and the projected world positions of the joints in joints.npz, pixels.
-
-    The cameras are those of cameras.json. 0 without joints.npz.
-
-    Raises:
-        FileError: joints.npz is damaged or has another number of cameras.
-    """
-    path = subject.folder / "joints.npz"
-    try:
-        stored = read_numbers(path, ("world", "pixel"))
-    except FileNotFoundError:
-        return 0.0
-    if stored["pixel"].shape != (len(subject.views), *stored["world"].shape[:2], 2):
-        reason = f"has joints of shape {stored['pixel'].shape} for {len(subject.views)} cameras"
-        raise FileError(path, reason, "render again")
-    errors = [
-        view.project(stored["world"])[0] - pixel for view, pixel in zip(subject.views, stored["pixel"], strict=True)
-    ]
-    return float(np.linalg.norm(errors, axis=-1).max())
 
 
 def _chosen(captures: Captures, rows: int) -> list[tuple[str, int]]:

@@ -1,4 +1,4 @@
-"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, export, coco and farm."""
+"""Multi-view captures: `primdiffusion captures` render, info, sheet, export, coco and farm."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from tqdm import tqdm
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.camera_files import Project, export_cameras
-from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
+from primdiffusion.capture.coco import ANNOTATIONS_FILE, write_coco
 from primdiffusion.capture.composed import Backgrounds
-from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
-from primdiffusion.capture.poses import choose_poses, read_motions
+from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
@@ -29,7 +28,6 @@ from primdiffusion.evaluation.images import folder_pictures
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
-from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.schema import Range, check
@@ -97,34 +95,27 @@ class RenderCaptures:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
         if self.released_reference and self.together > 1:
             raise ValueError("the released code expects its reference alone: leave out --together")
-        poses, unread = self._poses()
         job = RenderJob(
             people={name: people[name] for name in names},
-            poses=poses,
+            poses=self._chosen_poses(),
             out=self.out,
             rig=Rig(self.arrangement, self.cameras, self.elevations, width=self.size, height=self.size),
             passes=passes,
             samples=self.samples,
             seed=self.seed,
             released_reference=self.released_reference,
-            unread_poses=tuple(unread),
             together=self._groups(people) if self.together > 1 else (),
             read=read_subject,
             renderer=renderer_of(tuple(people.values())),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
-        for error in unread:
-            print(printable(f"poses  failed  {error}"), flush=True)
         outcomes = Counter()
         for outcome in tqdm(render(job, self.workers), total=len(names), unit="human", disable=None):
             outcomes[outcome.status] += 1
             said = outcome.error or f"{outcome.views} views"
             print(printable(f"{outcome.subject}  {outcome.status}  {said}"), flush=True)
-        if outcomes["failed"] or unread:
-            poses_too = f" and {len(unread)} of {len(self.poses)} pose files" if unread else ""
-            raise ValueError(
-                f"{outcomes['failed']} of {len(names)} humans{poses_too} failed: {self.out / job.part}.json says why"
-            )
+        if outcomes["failed"]:
+            raise ValueError(f"{outcomes['failed']} of {len(names)} humans failed: {self.out / job.part}.json says why")
 
     def _passes(self, people: Mapping[str, Path]) -> tuple[str, ...]:
         """Return the passes to write. Raises ValueError for those that a human does not have."""
@@ -144,14 +135,10 @@ class RenderCaptures:
         parts = [names[first : first + self.together] for first in range(0, len(names), self.together)]
         return tuple({name: people[name] for name in part} for part in parts)
 
-    def _poses(self) -> tuple[BodyPose, list[str]]:
-        """Return the poses, and the errors of unreadable motion files. Raises ValueError if all are."""
-        if not self.pose_count:
-            return read_motion(self.poses[0]), []
-        motions, unread = read_motions(self.poses)
-        if self.poses and not motions:
-            raise ValueError(f"none of the {len(self.poses)} pose files can be used: {unread[-1]}")
-        return choose_poses(motions, self.pose_count, self.seed), unread
+    def _chosen_poses(self) -> BodyPose:
+        """Return the poses. Raises as `read_motion` and `choose_poses`."""
+        motions = [read_motion(path) for path in self.poses]
+        return choose_poses(motions, self.pose_count, self.seed) if self.pose_count else motions[0]
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -163,32 +150,6 @@ def parse_shard(text: str) -> tuple[int, int]:
     if not 0 <= index < count:
         raise ValueError(f"shard {text!r}: write i/n with i from 0 to n - 1, such as 0/4")
     return index, count
-
-
-@dataclasses.dataclass(frozen=True)
-class VerifyCaptures:
-    """Find damaged, missing and unfinished files."""
-
-    root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset."""
-    repair: bool = False
-    """Remove damaged files, so that the command that rendered them renders them again."""
-    quick: bool = False
-    """Compare sizes instead of checksums."""
-
-    def run(self) -> None:
-        """Print a line for each finding; raises ValueError if there is any."""
-        findings = verify(self.root, checksums=not self.quick)
-        for path, what in findings.items():
-            print(printable(f"{path}: {what}"))
-        if not findings:
-            print(f"{self.root}: {len(subject_folders(self.root))} subjects, nothing wrong")
-            return
-        remedy = "--repair removes what is damaged, to be rendered again"
-        if self.repair:
-            repair(self.root, findings)
-            remedy = "damaged files are removed: give the command that rendered them again"
-        raise ValueError(f"{len(findings)} things are wrong in {self.root}: {remedy}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,27 +170,10 @@ class InfoOfCaptures:
             "cameras": len(first.views),
             "size": [view.width, view.height],
             "passes": captures.passes,
-            "packed": sum(open_pack(captures.subject(name)) is not None for name in captures.subjects),
             "first_subject": first.name,
             "dataset": captures.about or "released layout, without dataset.json",
         }
         print(json.dumps(about, indent=2))
-
-
-@dataclasses.dataclass(frozen=True)
-class PackCaptures:
-    """Pack images and masks into an array per subject that training maps into memory: large, but quick to read."""
-
-    root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset; the arrays go to its folder `packed`."""
-
-    def run(self) -> None:
-        """Pack, and print a line for each subject."""
-        captures = open_captures(self.root)
-        for packing in tqdm(pack(captures), total=len(captures.subjects), unit="human", disable=None):
-            print(
-                f"{packing.subject}  {'found' if packing.found else 'packed'}  {packing.gigabytes:.3f} GB", flush=True
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,10 +192,10 @@ class SheetOfCaptures:
     """Height of an image on the sheet, pixels."""
 
     def run(self) -> None:
-        """Draw; print the path and the largest reprojection error of the joints, pixels."""
+        """Draw; print the path."""
         captures = open_captures(self.root)
-        error = draw_sheet(captures, self.out, self.rows, self.columns, self.size)
-        print(f"{self.out}  joints drawn, largest error {error:.4f} px")
+        draw_sheet(captures, self.out, self.rows, self.columns, self.size)
+        print(self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,26 +218,26 @@ class ExportCaptures:
 
 @dataclasses.dataclass(frozen=True)
 class AnnotateCaptures:
-    """Write annotations in COCO's format (boxes, masks, 17 keypoints, SMPL) and a table of all images."""
+    """Write annotations in COCO's format (boxes, masks, 17 keypoints, SMPL)."""
 
     root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset, with images, masks and depth; the files go there."""
+    """Folder of a capture dataset, with images, masks and depth; the file goes there."""
     people: Path | None = None
-    """Folder of `primdiffusion people` that the captures show: its attributes become columns of the table."""
+    """Folder of `primdiffusion people` that the captures show: its attributes are annotated too."""
     backgrounds: Path | None = None
     """Folder of pictures to put behind the humans; the default leaves the images over black."""
     seed: int = 0
     """Seed of the choice of a background for each image."""
 
     def run(self) -> None:
-        """Write both files, and print their paths."""
+        """Write the file, and print its path."""
         captures = open_captures(self.root)
         cards = {} if self.people is None else read_cards(self.people)
         attributes = {name: card.get("attributes", {}) for name, card in cards.items()}
         backgrounds = self.backgrounds and Backgrounds(tuple(folder_pictures(self.backgrounds)), self.seed)
         with tqdm(total=len(captures.subjects), unit="human", disable=None) as progress:
             write_coco(captures, attributes, backgrounds, lambda _: progress.update())
-        print(f"{self.root / ANNOTATIONS_FILE}\n{self.root / TABLE_FILE}")
+        print(self.root / ANNOTATIONS_FILE)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -321,9 +265,7 @@ class FarmCaptures(Farm):
 
 Command = (
     Annotated[RenderCaptures, tyro.conf.subcommand("render")]
-    | Annotated[VerifyCaptures, tyro.conf.subcommand("verify")]
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
-    | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
     | Annotated[ExportCaptures, tyro.conf.subcommand("export")]
     | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]

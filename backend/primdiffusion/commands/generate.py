@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload
 from primdiffusion.editing.vary import vary_batch
 from primdiffusion.files.regular_files import check_unlinked
-from primdiffusion.files.whole_files import staged, staged_together
+from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import HumanAnswer, VariationFiles, VariationsAnswer
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
 from primdiffusion.human import Human, generate_batch, people_of
@@ -38,7 +39,7 @@ from primdiffusion.runtime.machine import peak_memory_gb
 
 
 def generate(request: GenerateRequest, session: Session, report: ReportProgress) -> HumanAnswer:
-    """Sample batch by batch, and write the files of a batch, all or none; return those of the last human.
+    """Sample batch by batch, and write the files of each human, all or none; return those of the last one.
 
     The humans before it are reported when they are finished. Raises OSError first of all if a folder cannot be written
     to; raises as load_checkpoint and generate_batch.
@@ -61,7 +62,8 @@ def _generate_batch(
         folders = [request.out_dir / f"seed_{seed:06d}" for seed in seeds]
         for folder in folders:
             check_unlinked(folder)
-    with staged_together(folders) as unfinished:
+    with contextlib.ExitStack() as files:
+        unfinished = [files.enter_context(staged(folder)) for folder in folders]
         report("load", 0, steps, None)
         model = session.model(request.checkpoint)
         report("sample", 0, steps, None)

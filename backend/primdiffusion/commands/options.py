@@ -70,8 +70,8 @@ class RefineCommand:
     subject: str | None = None
     """Name of the subject; not needed if there is only one."""
     start: str = "body"
-    """Initial human: body (the bare body in grey), encoder (reconstructed from the first frame), or a file: a
-    .human.safetensors, or a .glb of primdiffusion people."""
+    """Initial human: body (the bare body in grey), encoder (reconstructed from the first frame), or a
+    .human.safetensors."""
     checkpoint: Path | None = None
     """Trained encoder (.safetensors) for --start encoder; the default is the one in the package."""
     steps: int = 150
@@ -80,10 +80,8 @@ class RefineCommand:
     """Largest side of the images used, and width and height of the previews, pixels."""
     hold_out_cameras: int = 3
     """Number of cameras, evenly spaced, held out for evaluation."""
-    minutes: float = 5.0
-    """Time limit of the optimisation."""
     seed: int = 0
-    """Seed of the order of views; the same seed gives the same human unless time runs out."""
+    """Seed of the order of views; the same seed gives the same human."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

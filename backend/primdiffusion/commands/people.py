@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from primdiffusion.capture.reader import open_captures
@@ -16,7 +15,7 @@ from primdiffusion.commands.session import Session
 from primdiffusion.files.folder_lock import lock_folder
 from primdiffusion.files.regular_files import printable
 from primdiffusion.people.assets import open_assets
-from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
+from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
@@ -29,13 +28,6 @@ def people(command: PeopleCommand, session: Session, report: ReportProgress) -> 
     with lock_folder(command.out):
         for done in make_people(assets, wanted, command.workers):
             report("people", done, command.count, None)
-    unknown = unknown_licences(command.out)
-    if unknown:
-        print(
-            f"primdiffusion: {len(unknown)} asset files state no licence ({printable(unknown[0])}, ...), so the "
-            "manifest lists it as unknown: list them in a LICENSES.txt beside the asset folder",
-            file=sys.stderr,
-        )
     return command.out
 
 

@@ -37,7 +37,7 @@ from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_
 from primdiffusion.reconstruction.posture_start import write_posture
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.machine import peak_memory_gb
-from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
+from primdiffusion.training.refine import bare_body, refine, view_psnr
 
 STAGES = 4
 """Load, read, encode, write."""
@@ -110,7 +110,7 @@ def refine_human(command: RefineCommand, session: Session, report: ReportProgres
     Raises:
         ValueError, FileNotFoundError: captures, start or settings are missing, damaged or do not match; OSError.
     """
-    settings = DescentSettings(command.steps, seconds=60 * command.minutes, seed=command.seed)
+    settings = DescentSettings(command.steps, seed=command.seed)
     with staged(command.out) as folder:
         captures, name = choose_subject(command.capture, command.subject)
         person = captures.subject(name)
@@ -121,18 +121,15 @@ def refine_human(command: RefineCommand, session: Session, report: ReportProgres
         held_out = [conditioning_views(captures, name, frame, held, command.size) for frame in frames if held]
         human = _start(command, session, captures, name, betas, given).to(session.device)
         done = itertools.count(1)
-        refined = refine(human, views, settings, lambda _: report("refine", next(done), command.steps, None))
+        refined = refine(human, views, settings, lambda: report("refine", next(done), command.steps, None))
         write_human(folder, refined.human, command.size)
-    seconds = f"{refined.steps} steps, {refined.seconds:.1f} s"
-    print(f"{command.out}  {name}, {person.frames} frames, {len(given)} cameras, {seconds}")
+    print(f"{command.out}  {name}, {person.frames} frames, {len(given)} cameras, {command.steps} steps")
     print(f"given views     {refined.psnr_before:.2f} -> {refined.psnr_after:.2f} dB")
     if held:
         before, after = (float(view_psnr(one, held_out).mean()) for one in (human, refined.human))
         print(f"held-out views  {before:.2f} -> {after:.2f} dB (cameras {', '.join(map(str, held))})")
         if after < before:
             print_warnings(["the held-out PSNR decreased: use more views"])
-    if refined.steps < command.steps:
-        print_warnings([f"the time limit of {command.minutes:g} minutes was reached after {seconds}"])
 
 
 def _start(
@@ -147,8 +144,6 @@ def _start(
         human = reconstruct_human(
             session.encoder(command.checkpoint), CapturedPerson(name, 0, cameras, views, betas, ())
         )
-    elif command.start.endswith(".glb"):
-        human = meshed_person(command.start)
     else:
         human = load_human(command.start)
     if human.body_setup is not None:

@@ -22,7 +22,7 @@ from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.pictures import opened_picture, strips
+from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.assets import Assets
@@ -43,8 +43,6 @@ FAR_OUTSIDE = 100
 """Widths of the picture that no joint is away from its corner."""
 WHITE_DISTANCE = 6
 """Pictures without alpha: a pixel whose channels are all within this of white (255) is background."""
-STRIP_PIXELS = 2**17
-"""Pixels that are resized at once."""
 SUPERSAMPLE = 2
 """Samples along a pixel's side in renders of meshes."""
 SUFFIXES, FORMATS = (".png", ".jpg", ".jpeg", ".webp"), ("PNG", "JPEG", "WEBP")
@@ -206,19 +204,12 @@ def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], int, bool]:
 
 
 def _over_white(picture: Image.Image) -> tuple[Float[Tensor, "s s 4"], bool]:
-    """Colour over white and alpha, resized to SIDE; whether any of it is transparent.
-
-    The bicubic filter with antialiasing is separable: strips of rows are shrunk in width, and what they give in height.
-    A whole picture in float32 would take gigabytes.
-    """
-    narrow, has_alpha = torch.empty(picture.height, SIDE, 4), False
-    for top, strip in strips(picture, STRIP_PIXELS):
-        rgba = np.asarray(strip.convert("RGBA"))
-        has_alpha = has_alpha or int(rgba[..., 3].min()) < 255
-        values = torch.from_numpy(rgba.astype(np.float32)) / 255
-        values[..., :3] = values[..., :3] * values[..., 3:] + (1 - values[..., 3:])
-        narrow[top : top + len(values)] = _resized(values, (len(values), SIDE))
-    return _resized(narrow, (SIDE, SIDE)).clamp(0, 1), has_alpha
+    """Colour over white and alpha, resized to SIDE; whether any of it is transparent."""
+    rgba = np.asarray(picture.convert("RGBA"))
+    values = torch.from_numpy(rgba.astype(np.float32)) / 255
+    values[..., :3] = values[..., :3] * values[..., 3:] + (1 - values[..., 3:])
+    narrow = _resized(values, (picture.height, SIDE))
+    return _resized(narrow, (SIDE, SIDE)).clamp(0, 1), int(rgba[..., 3].min()) < 255
 
 
 def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Tensor, "h2 w2 c"]:

@@ -19,7 +19,6 @@ from torch.nn import functional
 
 from primdiffusion.capture.coco import JOINTS
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.evaluation.attribute_network import attribute_heads, detail_energies
 from primdiffusion.files import tensor_file
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
@@ -35,6 +34,8 @@ WINDOW = 2
 """Cells to each side of a heatmap's maximum over which the joint's position is averaged."""
 DETAIL_SIDE = 256
 """Size of the pictures whose fine detail is measured."""
+BANDS = (1.0, 2.0, 4.0)
+"""Standard deviations, in pixels, of the Gaussians whose differences are bands of detail: finer than each."""
 PCK_SHARE = 0.5
 """A joint is correct within this share of the head size: PCKh@0.5."""
 FLAT = 1e-9
@@ -192,3 +193,35 @@ def depth_error(
 
 def _standardised(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     return (values - values.mean()) / values.std(correction=0)
+
+
+def attribute_heads(vocabulary: AttributeVocabulary, features: int) -> nn.ModuleDict:
+    """A linear layer for each attribute: logits of a category's values, or a standardised scalar."""
+    sizes = {name: len(values) for name, values in vocabulary.categories.items()} | dict.fromkeys(vocabulary.scalars, 1)
+    return nn.ModuleDict({name: nn.Linear(features, size) for name, size in sizes.items()})
+
+
+def detail_energies(pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n d"]:
+    """Logarithm of the energy of each band of detail inside each portrait's figure, away from its outline."""
+    rgba = pictures.flatten(0, 1).float() / 255
+    alpha = rgba[..., 3]
+    image = (rgba[..., :3].mean(-1) + 0.5 * (1 - alpha))[:, None]
+    energies, finer = [], image
+    for sigma in BANDS:
+        coarser = _blurred(image, sigma)
+        reach = round(3 * sigma)
+        outside = -alpha[:, None]
+        for size, padding in (((1, 2 * reach + 1), (0, reach)), ((2 * reach + 1, 1), (reach, 0))):
+            outside = functional.max_pool2d(outside, size, stride=1, padding=padding)
+        inside = outside < -0.95
+        energy = ((finer - coarser).square() * inside).sum((1, 2, 3)) / inside.sum((1, 2, 3)).clamp_min(1)
+        energies.append((energy + 1e-7).log())
+        finer = coarser
+    return torch.stack(energies, dim=1).reshape(len(pictures), -1)
+
+
+def _blurred(images: Float[Tensor, "n 1 h w"], sigma: float) -> Float[Tensor, "n 1 h w"]:
+    offset = torch.arange(-round(3 * sigma), round(3 * sigma) + 1)
+    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, -1)
+    return functional.conv2d(functional.conv2d(images, kernel, padding="same"), kernel.mT, padding="same")

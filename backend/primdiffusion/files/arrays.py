@@ -16,7 +16,7 @@ from typing import IO, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .regular_files import FileContent, FileError, open_regular
+from .regular_files import FileError, open_regular
 
 LARGEST_BYTES = 512 * 2**20
 """Largest size of what one call reads: small files can claim petabytes. An hour of motion at 60 frames/s takes 285
@@ -35,11 +35,8 @@ _UNREADABLE = (
 )  # fmt: skip
 """What zipfile and numpy raise for damaged files."""
 
-Source = str | Path | FileContent
-"""A file by its path, or as it was read before."""
 
-
-def array_names(path: Source) -> list[str]:
+def array_names(path: str | Path) -> list[str]:
     """Return the names of the arrays in an .npz. Raises FileError for a damaged file, and OSError."""
     with _archive(path) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
@@ -52,7 +49,7 @@ def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
 
 
 def read_arrays(
-    path: Source, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
+    path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
 ) -> dict[str, NDArray]:
     """Read the arrays `required` of an .npz, and those of `optional` that it contains; others are not unpacked.
 
@@ -119,16 +116,14 @@ def check_shapes(
             raise FileError(path, found, "make it again")
 
 
-def read_npy(path: Source) -> NDArray:
+def read_npy(path: str | Path) -> NDArray:
     """Read an .npy file. Raises as `read_arrays`."""
-    with _npy(path) as stream:
+    with open_regular(path, LARGEST_BYTES) as stream, _damage_named(path):
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        _header(stream, size, path)
+        stream.seek(0)
         return np.load(stream, allow_pickle=False)
-
-
-def map_npy(path: str | Path) -> NDArray:
-    """Map an .npy file of any size into memory, read-only. Raises as `read_arrays`."""
-    with _npy(path, 2**62):
-        return np.load(path, "r", allow_pickle=False)
 
 
 def read_pickled_bytes(path: str | Path, name: str) -> bytes:
@@ -156,7 +151,7 @@ def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
 
 
 @contextlib.contextmanager
-def _damage_named(path: Source) -> Iterator[None]:
+def _damage_named(path: str | Path) -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of headers that Python 2 wrote
@@ -169,27 +164,16 @@ def _damage_named(path: Source) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _archive(path: Source) -> Iterator[zipfile.ZipFile]:
+def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
     with open_regular(path, LARGEST_FILE) as file, _damage_named(path), zipfile.ZipFile(file) as archive:
         yield archive
-
-
-@contextlib.contextmanager
-def _npy(path: Source, limit: int = LARGEST_BYTES) -> Iterator[BinaryIO]:
-    """Open an .npy file, whose header was checked."""
-    with open_regular(path, limit) as stream, _damage_named(path):
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(0)
-        _header(stream, size, path)
-        stream.seek(0)
-        yield stream
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
     return archive.NameToInfo.get(f"{name}.npy") or archive.NameToInfo.get(name)
 
 
-def _needed(archive: zipfile.ZipFile, path: Source, name: str) -> zipfile.ZipInfo:
+def _needed(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.ZipInfo:
     member = _member(archive, name)
     if member is None:
         raise FileError(path, f"holds no array {name!r}", "make it again")
@@ -198,19 +182,19 @@ def _needed(archive: zipfile.ZipFile, path: Source, name: str) -> zipfile.ZipInf
     return member
 
 
-def _error(path: Source, name: str, reason: str, remedy: str) -> FileError:
+def _error(path: str | Path, name: str, reason: str, remedy: str) -> FileError:
     """The fault of an array: of the member `name` of an archive, or of a file of its own."""
     return FileError(path, f"holds {name!r:.60}, which {reason}" if name else reason, remedy)
 
 
-def _check_size(size: int, packed: int, path: Source, name: str) -> None:
+def _check_size(size: int, packed: int, path: str | Path, name: str) -> None:
     if size > LARGEST_BYTES or size > max(MOST_REPEATED, LARGEST_RATIO * packed):
         reason = f"unpacks to {size / 2**20:.0f} MB from {packed / 2**20:.1f} MB"
         raise _error(path, name, reason, "split it into smaller files")
 
 
 def _header(
-    stream: IO[bytes] | BinaryIO, size: int, path: Source, name: str = "", kinds: str = _KINDS
+    stream: IO[bytes] | BinaryIO, size: int, path: str | Path, name: str = "", kinds: str = _KINDS
 ) -> tuple[int, ...]:
     """Read the shape of an array that fits into `size` bytes. Raises FileError."""
     try:

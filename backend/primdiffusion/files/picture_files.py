@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -10,15 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .regular_files import FileError, open_regular
 from .whole_files import replacing
 
 DEPTH_UNIT = 0.00025
 """Metres per unit of a depth file, which reaches 16.38 m."""
-LARGEST_PICTURE = 512 * 2**20
-"""Bytes."""
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
-_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _EXR, _EXR_LINES = b"\x76\x2f\x31\x01\x02\x00\x00\x00", 16
 """Magic number and version 2; lines of a chunk compressed by ZIP."""
 _EXR_CHANNEL = b"Y"
@@ -96,35 +91,3 @@ def normal_bytes(normal: NDArray, covered: NDArray) -> NDArray[np.uint8]:
     values = np.zeros(normal.shape, np.uint8)
     values[covered] = np.round((np.clip(normal[covered], -1, 1) + 1) * 127.5)
     return values
-
-
-def is_whole_picture(path: Path) -> bool:
-    """Return whether a .png, .jpg or .exr of captures has its first and last bytes; does not decode it."""
-    if path.suffix == ".exr":
-        return _is_whole_exr(path)
-    head, tail = (_PNG, _PNG_END) if path.suffix == ".png" else (_JPEG, _JPEG_END)
-    try:
-        with open_regular(path, LARGEST_PICTURE) as file:
-            begins = file.read(len(head)) == head
-            file.seek(-len(tail), os.SEEK_END)
-            return begins and file.read() == tail
-    except (OSError, FileError):
-        return False
-
-
-def _is_whole_exr(path: Path) -> bool:
-    """Whether the file has the header that `write_exr` gives it, and ends with the last chunk of its table."""
-    length = len(_exr_header(1, 1))
-    try:
-        with open_regular(path, LARGEST_PICTURE) as file:
-            header = file.read(length)
-            _, _, right, bottom = struct.unpack_from("<4i", header, header.index(b"box2i\0") + 10)
-            if header != _exr_header(bottom + 1, right + 1):
-                return False
-            file.seek(8 * (bottom // _EXR_LINES), os.SEEK_CUR)
-            (last,) = struct.unpack("<Q", file.read(8))
-            file.seek(last + 4)
-            (size,) = struct.unpack("<i", file.read(4))
-            return file.seek(0, os.SEEK_END) == last + 8 + size
-    except (OSError, struct.error, ValueError, OverflowError):
-        return False

@@ -4,9 +4,7 @@ leaving the folder that they belong to. Needs no numpy."""
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
-import hashlib
 import io
 import os
 import re
@@ -26,21 +24,20 @@ _LONGEST_PATH = 4096
 class FileError(ValueError):
     """A file or folder that cannot be used: which one, what is wrong with it, and what to do."""
 
-    def __init__(self, path: Path | str | FileContent, reason: str = "", remedy: str = ""):
+    def __init__(self, path: Path | str, reason: str = "", remedy: str = ""):
         """`reason` is a predicate ("is damaged"), `remedy` an imperative ("download it again").
 
         A single argument is the whole sentence: torch's data loader raises a worker's error anew from its text.
         """
-        self.path = path.path if isinstance(path, FileContent) else path
-        self.reason, self.remedy = reason, remedy
-        super().__init__(self.path, reason, remedy)  # by which it is pickled
+        self.path, self.reason, self.remedy = path, reason, remedy
+        super().__init__(path, reason, remedy)  # by which it is pickled
 
     def __str__(self) -> str:
         return f"{self.path} {self.reason}: {self.remedy}" if self.reason else str(self.path)
 
 
 @contextlib.contextmanager
-def as_file_error(path: Path | str | FileContent, reason: str, remedy: str, *also: type[Exception]) -> Iterator[None]:
+def as_file_error(path: Path | str, reason: str, remedy: str, *also: type[Exception]) -> Iterator[None]:
     """Raise FileError, with the words of the error in brackets, for what damaged content raises, and for `also`.
 
     A FileError passes through, because it already says what is wrong.
@@ -76,38 +73,11 @@ def check_regular(path: str | Path) -> os.stat_result:
     return status
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class FileContent:
-    """A regular file as it was when it was read. Readers take it in place of its path, which it is printed as.
-
-    So what was checked, by its hash for instance, is what is used, even if the file changes in between.
-    """
-
-    path: Path
-    content: bytes
-
-    @classmethod
-    def read(cls, path: str | Path, limit: int) -> FileContent:
-        """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
-        return cls(Path(path), read_regular(path, limit))
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the content, hexadecimal."""
-        return hashlib.sha256(self.content).hexdigest()
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-
-def open_regular(path: str | Path | FileContent, limit: int) -> io.BufferedReader | io.BytesIO:
+def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO:
     """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and FileError.
 
     A file that states no size is read as empty: those of /proc may be endless.
     """
-    if isinstance(path, FileContent):
-        check_size(path, len(path.content), limit)
-        return io.BytesIO(path.content)
     size = check_regular(path).st_size  # before it is opened: to open a device may already do something
     check_size(path, size, limit)
     if not size:
@@ -124,7 +94,7 @@ def open_regular(path: str | Path | FileContent, limit: int) -> io.BufferedReade
     return file
 
 
-def read_regular(path: str | Path | FileContent, limit: int) -> bytes:
+def read_regular(path: str | Path, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
     with open_regular(path, limit) as file:
         size = file.seek(0, io.SEEK_END)  # some files grow
@@ -133,7 +103,7 @@ def read_regular(path: str | Path | FileContent, limit: int) -> bytes:
         return file.read(size)  # not up to the limit, for which Python would take memory
 
 
-def check_size(path: str | Path | FileContent, size: int, limit: int) -> None:
+def check_size(path: str | Path, size: int, limit: int) -> None:
     """Raise FileError where `size` is over `limit`, bytes."""
     if size > limit:
         raise FileError(path, f"is larger than {limit / 2**20:.0f} MB, the most for its kind", "use a smaller file")

@@ -2,9 +2,9 @@
 
 A pickle is a program that may call any importable function. This reader maps every allowed global to one of the inert
 records below, which only store their arguments, and rejects all others. `as_array` rebuilds arrays afterwards, so not
-even numpy or scipy interprets the file's instructions. Operations are counted and checked as they run: those that would
-take memory, time or C stack out of proportion to the file are rejected. Reads files written by Python 2 (latin1
-strings), chumpy, joblib, and old and new versions of numpy and scipy; chumpy and joblib need not be installed.
+even numpy or scipy interprets the file's instructions. Operations that would take memory or C stack out of proportion
+to the file are rejected. Reads files written by Python 2 (latin1 strings), chumpy, joblib, and old and new versions of
+numpy and scipy; chumpy and joblib need not be installed.
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from .regular_files import FileContent, FileError
+from .regular_files import FileError, read_regular
 
-MOST_OPERATIONS = 300_000
-"""Operations of a small file; SMPL's have a few thousand: their arrays are one string each."""
-BYTES_AN_OPERATION = 8
-"""Of a larger file, in which trackers write a few small arrays for each frame."""
+MOST_OPERATIONS, BYTES_AN_OPERATION = 300_000, 8
+"""Operations of a small file, and bytes for each of a larger one; SMPL's have a few thousand."""
 LARGEST_UNPACKED = 256 * 2**20
 """Bytes of a compressed file, unpacked."""
 MOST_NUMBERS = 10_000_000
@@ -143,42 +141,43 @@ _GLOBALS: dict[tuple[str, str], type] = {
 }
 
 
-class _Operations(dict[int, Callable[[Any], None]]):
-    """Operations by their byte, of which as many may run as the file's size allows."""
+def _operations() -> dict[int, Callable[[Any], None]]:
+    """Python's operations by their byte, without sets and with dictionaries whose keys are not tuples: Python hashes
+    tuples in tuples recursively."""
+    known = dict(pickle._Unpickler.dispatch)  # pyright: ignore[reportAttributeAccessIssue]
+    for code in (pickle.ADDITEMS, pickle.FROZENSET):
+        del known[code[0]]
+    for code in (pickle.SETITEM, pickle.SETITEMS, pickle.DICT):
+        known[code[0]] = _of_names(known[code[0]])
+    known[pickle.BYTEARRAY8[0]] = known[pickle.BINBYTES8[0]]  # which reads no more than there is
+    return known
+
+
+def _of_names(operation: Callable[[Any], None]) -> Callable[[Any], None]:
+    def checked(unpickler: Any) -> None:
+        if any(isinstance(key, tuple) for key in unpickler.stack[-2::-2]):
+            raise ValueError("the key of a dictionary is a tuple")
+        operation(unpickler)
+
+    return checked
+
+
+_OPERATIONS = _operations()
+
+
+class _Counted(dict[int, Callable[[Any], None]]):
+    """Operations, of which as many may run as the file's size allows."""
 
     def __init__(self, size: int) -> None:
-        super().__init__(pickle._Unpickler.dispatch)  # pyright: ignore[reportAttributeAccessIssue]
+        super().__init__(_OPERATIONS)
         self._left = max(MOST_OPERATIONS, size // BYTES_AN_OPERATION)
-        hashed = {
-            pickle.SETITEM: lambda stack: stack[-2:-1],
-            pickle.SETITEMS: lambda stack: stack[::2],
-            pickle.DICT: lambda stack: stack[::2],
-            pickle.ADDITEMS: lambda stack: stack,
-            pickle.FROZENSET: lambda stack: stack,
-        }
-        for code, keys in hashed.items():
-            self[code[0]] = self._of_names(super().__getitem__(code[0]), keys)
-        self[pickle.BYTEARRAY8[0]] = super().__getitem__(pickle.BINBYTES8[0])  # which reads no more than there is
 
     def __getitem__(self, code: int) -> Callable[[Any], None]:
-        """An operation, to run it. Raises ValueError after too many, and for a byte that is none."""
+        """An operation, to run it. Raises ValueError after too many, KeyError."""
         self._left -= 1
         if self._left < 0:
             raise ValueError("it has more operations than arrays need")
-        if code not in self:
-            raise ValueError(f"the byte {code} is no operation")
         return super().__getitem__(code)
-
-    @staticmethod
-    def _of_names(operation: Callable[[Any], None], keys: Callable[[list], list]) -> Callable[[Any], None]:
-        """The operation for keys that are not tuples: Python hashes tuples in tuples recursively."""
-
-        def checked(unpickler: Any) -> None:
-            if any(isinstance(key, tuple | frozenset) for key in keys(unpickler.stack)):
-                raise ValueError("the key of a dictionary is a tuple")
-            operation(unpickler)
-
-        return checked
 
 
 class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
@@ -188,7 +187,7 @@ class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIss
     def __init__(self, data: bytes, path: str | Path) -> None:
         stream = io.BytesIO(data)
         super().__init__(stream, encoding="latin1")
-        self.dispatch = _Operations(len(data))  # pyright: ignore[reportAttributeAccessIssue]
+        self.dispatch = _Counted(len(data))  # pyright: ignore[reportAttributeAccessIssue]
         self._path = path
         self._joblib_array = type("_JoblibArray", (_JoblibArray,), {"stream": stream})
 
@@ -217,16 +216,17 @@ def _unpacked(data: bytes) -> bytes:
     return unpacked
 
 
-def read_pickle(file: FileContent) -> dict[str, object]:
-    """Return the top-level dictionary of an SMPL pickle; convert values to arrays with `as_array`.
+def read_pickle(path: Path, limit: int) -> dict[str, object]:
+    """Return the dictionary in an SMPL pickle of at most `limit` bytes; convert values to arrays with `as_array`.
 
     Raises:
         FileError: as `load_restricted`, or it does not hold a dictionary.
+        OSError: it cannot be opened.
     """
-    content = load_restricted(file.content, file.path)
+    content = load_restricted(read_regular(path, limit), path)
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         kind = type(content).__name__
-        raise FileError(file, f"holds no dictionary of named arrays but a {kind}", "use a body model in SMPL's format")
+        raise FileError(path, f"holds no dictionary of named arrays but a {kind}", "use a body model in SMPL's format")
     return content
 
 
@@ -234,8 +234,7 @@ def load_restricted(data: bytes, path: str | Path) -> object:
     """Load a pickle, the content of the file `path`, with inert records in place of objects.
 
     Raises:
-        FileError: it names a global outside the list above, is not a pickle, is truncated, or has more operations than
-            MOST_OPERATIONS and its size allow.
+        FileError: it names a global outside the list above, is not a pickle, or is truncated.
     """
     try:
         return _Unpickler(_unpacked(data), path).load()

@@ -1,28 +1,22 @@
 """Files and folders that appear whole or not at all, written under temporary names. Needs no numpy.
 
-A temporary name, `.STEM.SPACE-PID-RANDOM.partial.SUFFIX`, is random and tells its writer: PID counts only where SPACE,
-a digest of the machine's start and of its namespace of process ids, is the reader's own. What a killed process left is
-removed by the next writer to the same place: at once where that process is known to have ended, and elsewhere (another
-container, another machine on a network disk) when nothing of it has changed for a day.
+A temporary name is `.STEM.PID-RANDOM.partial.SUFFIX`. What a killed process left is removed by the next writer to the
+same place once nothing of it has changed for a day: whether a process of another machine has ended cannot be asked.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import os
-import platform
 import re
 import secrets
-import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Iterator
 from pathlib import Path
 
-from .regular_files import check_inside, open_to_append, real_path, remove_file, remove_folder
+from .regular_files import check_inside, open_to_append, remove_file, remove_folder
 
 if sys.platform == "win32":
     import msvcrt
@@ -30,20 +24,13 @@ else:
     import fcntl
 
 ABANDONED_AFTER_S = 86_400.0
-"""Age of a temporary file, seconds, from which its writer counts as ended where that cannot be asked."""
-_WRITER = re.compile(r"(?P<space>[0-9a-f]{8})-(?P<pid>[0-9]{1,10})-[0-9a-f]{8}")
-_TEMPORARY = re.compile(rf"\.(?P<stem>.*)\.{_WRITER.pattern}\.partial(?P<suffix>\.[^.]*)?")
-_REPLACED = "replaced"
-
-
-def writer() -> str:
-    """This process, and a random part: for names of temporary files."""
-    return f"{_space()}-{os.getpid()}-{secrets.token_hex(4)}"
+"""Age of a temporary file, seconds, from which its writer counts as ended."""
+_TEMPORARY = re.compile(r"\.(?P<stem>.*)\.(?P<pid>[0-9]{1,10})-[0-9a-f]{8}\.partial(?P<suffix>\.[^.]*)?")
 
 
 def temporary_name(path: Path) -> Path:
     """An unused name beside `path`, to write to."""
-    return path.with_name(f".{path.stem}.{writer()}.partial{path.suffix}")
+    return path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
 
 
 @contextlib.contextmanager
@@ -57,41 +44,24 @@ def temporary_folder(path: Path) -> Iterator[Path]:
         remove_folder(folder, folder.parent)
 
 
-def is_abandoned(path: Path) -> bool:
-    """Whether a temporary file or folder belongs to no running process, as far as can be told."""
-    named = _TEMPORARY.fullmatch(path.name)
-    running = _is_running(named["space"], int(named["pid"])) if named else None
-    if running is not None:
-        return not running
-    try:
-        inside = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
-        newest = max(entry.lstat().st_mtime for entry in (path, *inside))
-    except OSError:  # gone meanwhile, or not ours
-        return False
-    return time.time() - newest > ABANDONED_AFTER_S
+def remove_abandoned(folder: Path, of: Path | None = None, after_s: float = ABANDONED_AFTER_S) -> None:
+    """Remove what killed processes left in a folder, only what was to become `of` if given. Raises no OSError.
 
-
-def has_ended(name: str) -> bool:
-    """Whether a name that contains `writer()` is of a process that is known to have ended."""
-    named = _WRITER.search(name)
-    return named is not None and _is_running(named["space"], int(named["pid"])) is False
-
-
-def remove_abandoned(folder: Path, of: Path | None = None) -> None:
-    """Remove what killed processes left in a folder, only what was to become `of` if given. Raises no OSError."""
-    for path in _temporary_files(folder):
-        named = _TEMPORARY.fullmatch(path.name)
-        if named and (of is None or (named["stem"], named["suffix"] or "") == (of.stem, of.suffix)):
+    Who holds the folder alone (`folder_lock`) knows that no other process writes there: `after_s` is 0 then.
+    """
+    for path, named in _temporary_files(folder):
+        if of is None or (named["stem"], named["suffix"] or "") == (of.stem, of.suffix):
             with contextlib.suppress(OSError):
-                if is_abandoned(path):
+                inside = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
+                newest = max(entry.lstat().st_mtime for entry in (path, *inside))
+                if time.time() - newest >= after_s:
                     _remove(path)
 
 
 def remove_of_process(folder: Path, pid: int) -> None:
     """Remove what a process of this machine, which has been killed, left in a folder. Raises no OSError."""
-    for path in _temporary_files(folder):
-        named = _TEMPORARY.fullmatch(path.name)
-        if named and (named["space"], int(named["pid"])) == (_space(), pid):
+    for path, named in _temporary_files(folder):
+        if int(named["pid"]) == pid:
             with contextlib.suppress(OSError):
                 _remove(path)
 
@@ -145,84 +115,51 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def staged(folder: str | Path, last: str = "") -> Iterator[Path]:
-    """Yield a temporary folder inside `folder`, to which its files move at the end, replacing files of the same names.
+def staged(folder: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder inside `folder`, to which its files and folders move at the end, replacing those of the
+    same names.
 
-    The file named `last` moves last. After an error everything is removed, including a newly created `folder`. Raises
-    OSError, naming the file in `folder`; at once if it cannot be written to.
+    After an error everything is removed, including a newly created `folder`. Raises OSError, naming the file in
+    `folder`; at once if it cannot be written to.
     """
-    with staged_together([folder], last) as (aside,):
-        yield aside
-
-
-@contextlib.contextmanager
-def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[list[Path]]:
-    """`staged` for several folders, whose files move at the end in all of them or in none."""
-    targets = [Path(folder) for folder in folders]
-    made: list[Path] = []
-    asides: list[Path] = []
+    target, made = Path(folder), []
+    aside = temporary_name(target / "files")
     try:
-        for target in targets:
-            made += create_folders(target)
-            remove_abandoned(target)
-            asides.append(temporary_name(target / "files"))
-            asides[-1].mkdir()
-        yield asides
-        publish(list(zip(asides, targets, strict=True)), last)
+        made = _create_folders(target)
+        remove_abandoned(target)
+        aside.mkdir()
+        yield aside
+        publish(aside, target)
         made = []
     except OSError as e:
-        for aside, target in zip(asides, targets, strict=False):
-            if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
-                raise type(e)(e.errno, e.strerror, str(target / path.relative_to(aside))) from e
+        if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
+            raise type(e)(e.errno, e.strerror, str(target / path.relative_to(aside))) from e
         raise
     finally:
-        for aside in asides:
-            remove_folder(aside, aside.parent)
-        remove_empty(made)
+        if target.is_dir():
+            remove_folder(aside, target)
+        for path in made:
+            with contextlib.suppress(OSError):  # in use
+                path.rmdir()
 
 
-def publish(moves: Sequence[tuple[Path, Path]], last: str = "") -> None:
-    """Move the content of folders into others of the same disk: all of it, or after an error nothing.
+def publish(made: Path, folder: Path) -> None:
+    """Move the content of a folder into another of the same disk: files replace files, and folders folders.
 
-    A file replaces a file of the same name, and a folder a folder. Of each pair the entry named `last` moves last.
     Of two processes one waits for the other, so that files of two results do not mix. Raises OSError;
     IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.
     """
-    with contextlib.ExitStack() as held:
-        for folder in sorted({real_path(folder) for _, folder in moves}):  # in one order: no process waits in a circle
-            held.enter_context(_alone_in(folder))
-        _publish(moves, last)
-
-
-def _publish(moves: Sequence[tuple[Path, Path]], last: str) -> None:
-    pieces = [
-        (path, folder / path.name, made / _REPLACED / path.name)
-        for made, folder in moves
-        for path in sorted(made.iterdir(), key=lambda path: (path.name == last, path.name))
-    ]
-    for path, target, _ in pieces:
-        if target.exists() and target.is_dir() != path.is_dir():
-            what = "a folder" if target.is_dir() else "not a folder"
-            number = errno.EISDIR if target.is_dir() else errno.ENOTDIR  # OSError becomes the class of its number
-            raise OSError(number, f"this is {what} and will not be replaced", str(target))
-    moved: list[tuple[Path, Path]] = []
-    try:
-        for path, target, old in pieces:
-            if target.exists():
-                _keep(target, old)
-            moved.append((target, old))
+    with _alone_in(folder):
+        pieces = [(path, folder / path.name) for path in sorted(made.iterdir())]
+        for path, target in pieces:
+            if target.exists() and target.is_dir() != path.is_dir():
+                what = "a folder" if target.is_dir() else "not a folder"
+                number = errno.EISDIR if target.is_dir() else errno.ENOTDIR  # OSError becomes the class of its number
+                raise OSError(number, f"this is {what} and will not be replaced", str(target))
+        for path, target in pieces:
+            if target.is_dir():
+                remove_folder(target, folder)
             os.replace(path, target)
-    except BaseException:
-        for target, old in reversed(moved):
-            with contextlib.suppress(OSError):
-                if target.is_dir() or not old.exists():
-                    _remove(target)
-                if old.exists():
-                    os.replace(old, target)
-        raise
-    finally:
-        for made, _ in moves:
-            remove_folder(made / _REPLACED, made)
 
 
 @contextlib.contextmanager
@@ -249,19 +186,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _keep(target: Path, old: Path) -> None:
-    """Keep what is about to be replaced: a file stays in place meanwhile."""
-    old.parent.mkdir(exist_ok=True)
-    if target.is_dir():
-        os.replace(target, old)
-        return
-    try:
-        os.link(target, old)
-    except OSError:  # a disk without links
-        shutil.copy2(target, old)
-
-
-def create_folders(folder: Path) -> list[Path]:
+def _create_folders(folder: Path) -> list[Path]:
     """Create `folder` and its missing parents; return the created ones, innermost first."""
     missing = []
     while not folder.exists():
@@ -272,18 +197,12 @@ def create_folders(folder: Path) -> list[Path]:
     return missing
 
 
-def remove_empty(created: Sequence[Path]) -> None:
-    """Remove the created folders, unless they are in use."""
-    for path in created:
-        with contextlib.suppress(OSError):
-            path.rmdir()
-
-
-def _temporary_files(folder: Path) -> list[Path]:
+def _temporary_files(folder: Path) -> list[tuple[Path, re.Match[str]]]:
     try:
-        return [Path(entry.path) for entry in os.scandir(folder) if entry.name[0] == "." and ".partial" in entry.name]
+        names = os.listdir(folder)
     except OSError:  # there is no such folder, or it cannot be read: writing will say so
         return []
+    return [(folder / name, named) for name in names if (named := _TEMPORARY.fullmatch(name))]
 
 
 def _remove(path: Path) -> None:
@@ -291,29 +210,3 @@ def _remove(path: Path) -> None:
         remove_folder(path, path.parent)
     else:
         remove_file(path, path.parent)
-
-
-@lru_cache(maxsize=1)
-def _space() -> str:
-    """Digest of the machine's start and of its namespace of process ids; random where the system does not tell them."""
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
-        known = f"{boot} {os.readlink('/proc/self/ns/pid')}"
-    except OSError:
-        known = platform.node() if sys.platform in ("darwin", "win32") else secrets.token_hex(8)
-    return hashlib.sha256(known.encode()).hexdigest()[:8]
-
-
-def _is_running(space: str, pid: int) -> bool | None:
-    """None where it cannot be told: other machines and containers, and Windows."""
-    if space != _space() or os.name == "nt" or pid < 1:
-        return None
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # another user's
-        return True
-    except OverflowError:
-        return None
-    return True

@@ -2,7 +2,7 @@
 
     root/dataset.json                              what the captures are: settings, axes, passes, names of parts
     root/release_human_list.txt                    one subject a line
-    root/annotations.json, root/images.csv         COCO annotations and a table of images: `captures coco`
+    root/annotations.json                          COCO annotations: `captures coco`
     root/composed/{id}/img/cameraNNNN/FFFF.jpg     of it: over backgrounds, or of several humans
     root/{id}/img/cameraNNNN/FFFF.jpg              sRGB over the background
     root/{id}/mask/cameraNNNN/FFFF.png             8 bits: share of the pixel that the person covers
@@ -17,7 +17,7 @@
     root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
     root/{id}/outputs_re_fitting/refit_smpl_2nd_plain.npz  the same as plain arrays: read this one
     root/{id}/nerf, opencv, colmap                 cameras for other projects: `captures export`
-    root/{id}/complete.json                        every file's size and CRC-32: written last
+    root/{id}/complete.json                        written last: a subject that has it is finished
 
 World: metres, y up, the person faces +z. Files are written under a temporary name, then renamed; several processes may
 write different subjects, or views, of one dataset. `picture_files` writes pictures.
@@ -28,19 +28,17 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.arrays import read_numbers
+from ..files.arrays import all_finite, read_numbers
 from ..files.json_files import parse_json, read_json
-from ..files.regular_files import FileError, check_inside, open_regular, read_regular, remove_file
-from ..files.whole_files import remove_abandoned, temporary_name, write_atomically
+from ..files.regular_files import FileError, as_file_error, read_regular, remove_file
+from ..files.whole_files import write_atomically
 from .camera_rig import View
 
 FORMAT, VERSION = "primdiffusion-captures", 1
@@ -53,8 +51,8 @@ SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.
 RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"
 """Name of the subject that determines the rest sizes of primitives in the released code."""
 LIST_FILE, DATASET_FILE, COMPLETE_FILE = "release_human_list.txt", "dataset.json", "complete.json"
-LARGEST_FILE, LARGEST_LIST = 512 * 2**20, 32 * 2**20
-"""Bytes of a file of a subject, and of the list of subjects."""
+LARGEST_LIST = 32 * 2**20
+"""Largest list of subjects, bytes."""
 
 
 def picture_path(subject: Path, kind: str, camera: int, frame: int) -> Path:
@@ -86,25 +84,11 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
     Raises FileError if the folder contains another dataset or other files.
     """
     wanted = {"format": FORMAT, "version": VERSION, **parse_json(json.dumps(about))}
-    remove_abandoned(root, root / DATASET_FILE)
     if not (root / DATASET_FILE).exists():
         if root.is_dir() and any(not path.name.startswith(".") for path in root.iterdir()):
             reason = f"is not empty and holds no {DATASET_FILE}"
             raise FileError(root, reason, "choose a new folder for the captures")
-        root.mkdir(parents=True, exist_ok=True)
-        unlike = temporary_name(root / DATASET_FILE)
-        try:  # a link fails where another process was first, which a rename would not
-            unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8", newline="\n")
-            try:
-                os.link(unlike, root / DATASET_FILE)
-            except FileExistsError:
-                pass
-            except OSError:  # a disk without links: exFAT, some network folders
-                os.replace(unlike, root / DATASET_FILE)
-        except OSError as e:
-            raise type(e)(e.errno, e.strerror or str(e), str(root / DATASET_FILE)) from e
-        finally:
-            remove_file(unlike, root)
+        write_atomically(root / DATASET_FILE, json.dumps(wanted, indent=1))
     present = read_about(root)
     differing = [key for key in {**present, **wanted} if present.get(key) != wanted.get(key)]
     if differing:
@@ -141,9 +125,11 @@ def read_list(root: Path) -> list[str]:
     return [name for line in text.splitlines() if (name := line.strip())]
 
 
-def write_list(root: Path, subjects: Sequence[str]) -> None:
-    """Write the sorted list of subjects."""
-    write_atomically(root / LIST_FILE, "".join(f"{name}\n" for name in sorted(subjects)))
+def list_subjects(root: Path) -> None:
+    """Write the sorted list of finished subjects, without the released code's reference, which repeats one."""
+    names = sorted(path.parent.name for path in root.glob(f"*/{COMPLETE_FILE}"))
+    listed = [name for name in names if not name.startswith(".") and name != RELEASED_REFERENCE]
+    write_atomically(root / LIST_FILE, "".join(f"{name}\n" for name in listed))
 
 
 def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas: NDArray, translation: NDArray) -> None:
@@ -179,44 +165,23 @@ def write_joints(subject: Path, views: Sequence[View], world: NDArray, fitted: N
 
 
 def complete(subject: Path) -> None:
-    """Record size and checksum of every file of a finished subject, and remove partial files of killed processes.
+    """Mark a subject as finished, and remove partial files of killed processes.
 
     Call it once, after all writing to the subject has ended.
     """
     for partial in subject.rglob(".*.partial.*"):
         remove_file(partial, subject)
-    files = {
-        path.relative_to(subject).as_posix(): [path.stat().st_size, _crc(path)]
-        for path in sorted(subject.rglob("*"))
-        if path.is_file() and not path.name.startswith(".") and path.name != COMPLETE_FILE
-    }
-    write_atomically(subject / COMPLETE_FILE, json.dumps(files, indent=0))
+    write_atomically(subject / COMPLETE_FILE, "{}\n")
 
 
-def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
-    """Return what is wrong with each damaged file of a finished subject, or with the folder of an unfinished one.
+def is_complete(subject: Path) -> bool:
+    """Whether a subject is finished."""
+    return (subject / COMPLETE_FILE).is_file()
 
-    An unfinished subject has no readable complete.json. Without `checksums` only sizes are compared. Never names a
-    file outside of the subject.
-    """
-    try:
-        files = read_json(subject / COMPLETE_FILE)
-        noted = {_inside(subject, name): (size, crc) for name, (size, crc) in files.items()}
-        if not all(type(number) is int for numbers in noted.values() for number in numbers):
-            raise TypeError("a size or a checksum is no integer")
-    except (OSError, ValueError, AttributeError, TypeError):
-        return {subject: "not finished"}
-    wrong = {}
-    for path, (size, crc) in noted.items():
-        if not path.is_file():
-            wrong[path] = "missing"
-        elif path.stat().st_size != size:
-            wrong[path] = f"{path.stat().st_size} bytes instead of {size}"
-        elif size > LARGEST_FILE:
-            wrong[path] = f"larger than {LARGEST_FILE // 2**20} MB"
-        elif checksums and _crc(path) != crc:
-            wrong[path] = "altered"
-    return wrong
+
+def is_complete_view(subject: Path, passes: Sequence[str], camera: int, frame: int) -> bool:
+    """Whether all images of a view exist: files appear whole or not at all."""
+    return all(picture_path(subject, kind, camera, frame).is_file() for kind in passes)
 
 
 def _check_same_smpl(subject: Path, wanted: Mapping[str, NDArray]) -> None:
@@ -230,22 +195,6 @@ def _check_same_smpl(subject: Path, wanted: Mapping[str, NDArray]) -> None:
             raise FileError(subject, reason, "choose another folder, or remove it")
 
 
-def _inside(subject: Path, name: str) -> Path:
-    if Path(name).is_absolute() or ".." in Path(name).parts or "\\" in name or not name.isprintable():
-        raise ValueError(f"{name!r} is no file of {subject}")
-    check_inside(subject / name, subject)
-    return subject / name
-
-
-def _crc(path: Path) -> int:
-    """Raises as `open_regular`."""
-    crc = 0
-    with open_regular(path, LARGEST_FILE) as file:
-        while chunk := file.read(1 << 20):
-            crc = zlib.crc32(chunk, crc)
-    return crc
-
-
 def write_cameras(subject: Path, views: Sequence[View]) -> None:
     """Write cameras.json for the released code."""
     named = {
@@ -253,3 +202,21 @@ def write_cameras(subject: Path, views: Sequence[View]) -> None:
         for i, v in enumerate(views)
     }
     write_atomically(subject / "cameras.json", json.dumps(named, indent=1))
+
+
+def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> list[View]:
+    """The cameras of {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}; `size` gives width and height by number.
+
+    Raises FileError, which names `path`, and what `size` raises.
+    """
+    views = []
+    for number in range(len(named) if isinstance(named, dict) else 0):
+        name = f"camera{number:04d}"
+        with as_file_error(path, f"has no camera in {name}", "render the captures again"):
+            k, r, t = (np.asarray(named[name][key], np.float64) for key in "KRT")
+            if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(map(all_finite, (k, r, t))):
+                raise ValueError("it is not finite, or its shapes are not K 3x3, R 3x3, T 3")
+            views.append(View(k, r, t.reshape(3), *size(number)))
+    if not views:
+        raise FileError(path, "contains no camera", "render the captures again")
+    return views

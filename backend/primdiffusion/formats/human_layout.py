@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.json_files import parse_json, parse_message
+from ..files.json_files import parse_json
 from .schema import FieldError, Open, Range, read
 
 COMPACT_VERSION = 3
@@ -60,20 +60,12 @@ def version_fault(metadata: Mapping[str, str]) -> tuple[str, str] | None:
 
 def provenance_of(metadata: Mapping[str, str]) -> dict[str, Any]:
     """How the human was made. Raises ValueError for what is no JSON object or has entries of a wrong type."""
-    text = metadata.get("provenance", "")
     try:
-        provenance = parse_message(text)
+        provenance = parse_json(metadata.get("provenance", ""))
     except ValueError as error:
-        raise _no_json(error) from error
-    check_provenance(provenance)  # first: it names the entry that is NaN
-    try:
-        return parse_json(text)
-    except ValueError as error:
-        raise _no_json(error) from error
-
-
-def _no_json(error: ValueError) -> ValueError:
-    return ValueError(f"its provenance is not JSON ({error!s:.100})")
+        raise ValueError(f"its provenance is not JSON ({error!s:.100})") from error
+    check_provenance(provenance)
+    return provenance
 
 
 def check_provenance(provenance: Any) -> None:

@@ -32,8 +32,6 @@ LARGEST_RATIO = 160
 JPEG it has 1.0 MB if all of it has one colour."""
 MOST_SCANS = 64
 """Scans of a JPEG, each of which passes over all of its pixels; progressive files have about ten."""
-STRIP_PIXELS = 2**20
-"""Pixels that are converted at once."""
 LARGEST_FILE = 512 * 2**20
 """Bytes of a picture file."""
 _UNREADABLE = (
@@ -92,13 +90,8 @@ def decoded_bytes(file_size: int) -> int:
 
 
 def decoded(picture: Image.Image, mode: str) -> UInt8[np.ndarray, "H W *channels"]:
-    """Decode a picture to Pillow's `mode` ("RGBA", "RGB", "L"), in strips: the result is the only other copy."""
-    bands = len(Image.new(mode, (1, 1)).getbands())
-    pixels = np.empty((picture.height, picture.width, bands), np.uint8)
-    for top, strip in strips(picture):
-        converted = strip if strip.mode == mode else strip.convert(mode)
-        pixels[top : top + strip.height] = np.asarray(converted).reshape(strip.height, strip.width, bands)
-    return pixels if bands > 1 else pixels[..., 0]
+    """Decode a picture to Pillow's `mode` ("RGBA", "RGB", "L")."""
+    return np.array(picture if picture.mode == mode else picture.convert(mode))
 
 
 def is_indexed(picture: Image.Image) -> bool:
@@ -110,18 +103,8 @@ def is_indexed(picture: Image.Image) -> bool:
 def label_values(picture: Image.Image) -> np.ndarray:
     """The values [H, W] by which a mask marks areas: indices (`is_indexed`), up to 16 bits of grey, or brightness."""
     if picture.mode.startswith("I"):
-        return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
+        return np.asarray(picture).astype(np.uint16)
     return decoded(picture, "P" if is_indexed(picture) else "L")
-
-
-def strips(picture: Image.Image, pixels: int | None = None) -> Iterator[tuple[int, Image.Image]]:
-    """Yield the picture in strips of whole rows of about `pixels`, each with the number of its first row."""
-    rows = max(1, (pixels or STRIP_PIXELS) // max(picture.width, 1))
-    if rows >= picture.height:  # without a copy
-        yield 0, picture
-        return
-    for top in range(0, picture.height, rows):
-        yield top, picture.crop((0, top, picture.width, min(top + rows, picture.height)))
 
 
 def _check_scans(file: BinaryIO | io.BufferedReader | io.BytesIO) -> None:

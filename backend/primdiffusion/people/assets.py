@@ -1,12 +1,8 @@
-"""Access to a MakeHuman asset pack (CC0): validation, decoded files cached per process, and licences.
+"""Access to a MakeHuman asset pack (CC0): validation, and decoded files cached per process.
 
 The pack is not part of this package. `open_assets` takes its folder as an argument or from the environment variable
 PRIMDIFFUSION_ASSETS; the folder contains `clothes`, `hair`, `eyebrows`, `eyelashes`, `eyes` and `skins` as does `base`
 in https://github.com/makehumancommunity/makehuman-assets. Images may be .png or .jpg.
-
-Text files (.mhclo, .obj, .mhmat) begin with comments that state their licence. Images are listed in a LICENSES.txt in
-or above the folder (a table `path | ... | licence | ...`), or referenced by a material in the same folder that states
-its own.
 """
 
 from __future__ import annotations
@@ -14,15 +10,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-import re
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.files.regular_files import as_file_error, open_regular, read_regular, real_path
-from primdiffusion.geometry.pictures import decoded, opened_picture, strips
+from primdiffusion.files.regular_files import as_file_error, real_path
+from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 
 ENVIRONMENT_VARIABLE = "PRIMDIFFUSION_ASSETS"
@@ -134,96 +129,5 @@ def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def _shrunk(picture: Image.Image, width: int) -> UInt8[np.ndarray, "H W 4"]:
-    """Shrink to a width, strip by strip: Pillow filters rows, rounds, and then columns, so the result is the same."""
-    narrow = Image.new("RGBa", (width, picture.height))
-    for top, strip in strips(picture):
-        premultiplied = strip.convert("RGBA").convert("RGBa")
-        narrow.paste(premultiplied.resize((width, strip.height), Image.Resampling.BOX), (0, top))
     size = (width, max(1, round(picture.height * width / picture.width)))
-    return np.array(narrow.resize(size, Image.Resampling.BOX).convert("RGBA"))
-
-
-UNKNOWN = "unknown"
-LIST = "LICENSES.txt"
-LEVELS = 3
-"""Number of folders searched for a list: the asset folder and its parents."""
-HEADER_BYTES = 4096
-LARGEST_LIST = 32 * 2**20
-"""Bytes."""
-STATED = (
-    (re.compile(r"\b(?:released as|licen[cs]ed? (?:under|is|:)?)\s*\W{0,3}(?:CC0\b|CC-0\b)", re.IGNORECASE), "CC0-1.0"),
-    (re.compile(r"\bCC[- ]?BY(?:[- ](?:SA|NC|ND))*(?:[- ]\d\.\d)?", re.IGNORECASE), ""),
-    (re.compile(r"\bA?GPL[- ]?v?\d(?:\.\d)?", re.IGNORECASE), ""),
-    (re.compile(r"\bCC0\b"), "CC0-1.0"),
-)
-"""Patterns of licence statements and the licences' names; an empty name stands for the matched text."""
-
-
-def licence_of(root: Path, path: str) -> str:
-    """Return the licence of an asset file, "unknown" if none is stated.
-
-    Args:
-        root: the asset folder.
-        path: path relative to it, with "/".
-    """
-    listed = _listed(root)
-    if path in listed:
-        return listed[path]
-    file = root / path
-    if file.suffix in (".mhclo", ".obj", ".mhmat"):
-        return _stated(file)
-    # The image may have been converted to another format since the material was written.
-    named = re.compile(rf"(?<![\w-]){re.escape(file.stem)}\.\w+")
-    for material in sorted(file.parent.glob("*.mhmat")):
-        if named.search(_head(material)):
-            return _stated(material)
-    return UNKNOWN
-
-
-@functools.lru_cache(maxsize=4)
-def _listed(root: Path) -> dict[str, str]:
-    """Licences by relative path, from the lists in and above the asset folder; the nearest list takes precedence."""
-    licences: dict[str, str] = {}
-    for folder in reversed((root, *root.parents)[:LEVELS]):
-        if (folder / LIST).is_file():
-            for path, licence in _table(read_regular(folder / LIST, LARGEST_LIST).decode("utf-8", "replace")).items():
-                for start in (folder, root):
-                    if (start / path).is_relative_to(root):
-                        licences[(start / path).relative_to(root).as_posix()] = licence
-    return licences
-
-
-def _table(text: str) -> dict[str, str]:
-    """Parse the columns "path" and "licence" of a table with a header row and cells separated by "|"."""
-    licences: dict[str, str] = {}
-    columns: list[str] = []
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.split("|")]
-        if len(cells) < 2:
-            continue
-        if not columns:
-            names = [cell.lower().replace("license", "licence") for cell in cells]
-            columns = names if {"path", "licence"} <= set(names) else []
-        elif len(cells) >= len(columns):
-            licences[cells[columns.index("path")]] = cells[columns.index("licence")].split(" (")[0]
-    return licences
-
-
-@functools.lru_cache(maxsize=1024)
-def _stated(file: Path) -> str:
-    """The licence stated in a text file's opening comments."""
-    comments = " ".join(line.lstrip("# ") for line in _head(file).splitlines() if line.startswith("#"))
-    for pattern, name in STATED:
-        found = pattern.search(comments)
-        if found:
-            return name or found[0]
-    return UNKNOWN
-
-
-@functools.lru_cache(maxsize=1024)
-def _head(file: Path) -> str:
-    try:
-        with open_regular(file, 2**62) as stream:
-            return stream.read(HEADER_BYTES).decode("utf-8", errors="replace")
-    except OSError:
-        return ""
+    return np.array(picture.convert("RGBA").convert("RGBa").resize(size, Image.Resampling.BOX).convert("RGBA"))

@@ -1,8 +1,8 @@
 """Write humans as a folder of rigged glTF files, from which captures are rendered.
 
-    manifest.json                    seed, count, people, and the licence of every asset used; written last
+    manifest.json                    seed, count, people, and every asset used; written last
     person_NNNNNN/person.glb         NNNNNN is the seed
-    person_NNNNNN/person.json        seed, betas, attributes, sources with licences, and the .glb's SHA-256
+    person_NNNNNN/person.json        seed, betas, attributes, asset files
 
 Each folder is written atomically, so that an interrupted run can be resumed.
 """
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import re
 from collections.abc import Iterator
@@ -22,14 +21,13 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.people_files import LARGEST_GLB
 from primdiffusion.files.json_files import read_json
-from primdiffusion.files.regular_files import FileError, as_file_error, read_regular, remove_folder
+from primdiffusion.files.regular_files import remove_folder
 from primdiffusion.files.whole_files import remove_abandoned, temporary_name, write_atomically
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import Count, Seed, check_seed
 from primdiffusion.formats.schema import Checked
-from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
+from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.people.person import Person, make_person
@@ -85,8 +83,8 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
         raise ValueError(f"workers is {workers}: give 1 or more")
     _check_folder(people)
     people.root.mkdir(parents=True, exist_ok=True)
-    remove_abandoned(people.root)
-    missing = [seed for seed in people.seeds if not is_whole(people.folder(seed), seed)]
+    remove_abandoned(people.root, after_s=0)
+    missing = [seed for seed in people.seeds if not is_there(people.folder(seed), seed)]
     done = people.count - len(missing)
     yield done
     jobs = [(assets, people.folder(seed), seed) for seed in missing]
@@ -103,8 +101,7 @@ def write_person(assets: Assets, folder: Path, seed: int) -> None:
     card = {
         **_identity(person, seed),
         "attributes": person.attributes,
-        "sources": [{"path": path, "licence": licence_of(assets.root, path)} for path in person.sources],
-        "sha256": hashlib.sha256(binary).hexdigest(),
+        "sources": [{"path": path} for path in person.sources],
     }
     partial = temporary_name(folder)
     try:
@@ -130,24 +127,9 @@ def skeleton_of(person: Person) -> Skeleton:
     return Skeleton(JOINT_NAMES, body.parents.tolist(), np.rint(joints * JOINT_GRID) / JOINT_GRID + 0.0)
 
 
-def is_whole(folder: Path, seed: int) -> bool:
-    """Whether a folder contains this sample, undamaged."""
-    card = _read_card(folder)
-    try:
-        return (
-            card is not None
-            and card["seed"] == seed
-            and card["sha256"] == hashlib.sha256(read_regular(folder / GLB, LARGEST_GLB)).hexdigest()
-        )
-    except (OSError, FileError, KeyError):
-        return False
-
-
-def unknown_licences(root: Path) -> list[str]:
-    """Assets in a folder's manifest whose licence is unknown. Raises ValueError for a damaged one, OSError."""
-    with as_file_error(root / MANIFEST, "is damaged", "make the humans again"):
-        manifest = read_json(root / MANIFEST)
-        return [str(asset["path"]) for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
+def is_there(folder: Path, seed: int) -> bool:
+    """Whether a folder contains this sample: folders appear whole or not at all."""
+    return (_read_card(folder) or {}).get("seed") == seed
 
 
 def _identity(person: Person, seed: int) -> dict[str, Any]:
@@ -174,16 +156,14 @@ def _check_folder(people: PeopleSet) -> None:
 
 
 def _write_manifest(people: PeopleSet) -> None:
-    licences: dict[str, str] = {}
-    for seed in people.seeds:
-        card = _read_card(people.folder(seed))
-        licences |= {source["path"]: source["licence"] for source in card["sources"]} if card else {}
+    cards = [_read_card(people.folder(seed)) or {} for seed in people.seeds]
+    used = sorted({source["path"] for card in cards for source in card.get("sources", ())})
     manifest = {
         "format": FORMAT,
         "version": VERSION,
         "seed": people.seed,
         "count": people.count,
-        "assets": [{"path": path, "licence": licences[path]} for path in sorted(licences)],
+        "assets": [{"path": path} for path in used],
         "people": [name_of(seed) for seed in people.seeds],
     }
     write_atomically(people.root / MANIFEST, json.dumps(manifest, indent=1) + "\n")

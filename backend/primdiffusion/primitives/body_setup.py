@@ -6,8 +6,8 @@ The license of such a body may not allow redistribution, so our files store its 
 from __future__ import annotations
 
 import dataclasses
-import errno
 import functools
+import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path, PureWindowsPath
@@ -16,16 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
-from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body, read_body_file
+from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.regular_files import (
-    FileContent,
-    FileError,
-    check_regular,
-    check_size,
-    is_plain_path,
-    real_path,
-)
+from primdiffusion.files.regular_files import FileError, check_regular, is_plain_path, open_regular, real_path
 from primdiffusion.formats.schema import read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
@@ -40,9 +33,9 @@ class FileFingerprint:
     sha256: str
 
     @classmethod
-    def of(cls, file: FileContent) -> FileFingerprint:
-        """Path and hash of what was read."""
-        return cls(str(real_path(file.path)), file.sha256)
+    def of(cls, path: Path) -> FileFingerprint:
+        """Path and hash of a file. Raises FileError, OSError."""
+        return cls(str(real_path(path)), _sha256(path))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,26 +71,27 @@ class BodySetup(TensorRecord):
 def body_setup_from_files(smpl: Path, uv: tuple[Path, ...]) -> BodySetup:
     """Load a body and build its anchors; rest extents are those of the template in the T pose.
 
-    Each file is opened once, so that what is recorded of it is what was loaded. Raises OSError and the errors of
-    `load_body`.
+    Raises OSError and the errors of `load_body`.
     """
-    return _load(read_body_file(smpl), tuple(map(read_body_file, uv)))
+    if not 1 <= len(uv) <= 2:
+        raise FileError(smpl, f"has {len(uv)} files of texture coordinates", "give 1 or 2")
+    body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
+    files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
+    return BodySetup(body, build_anchors(body, "released"), files)
 
 
 def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], beside: Iterable[Path]) -> BodySetup:
     """Load the body that a checkpoint or human refers to, with the rest extents stored there.
 
-    Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match, and
-    what is loaded are the bytes that were hashed. Raises FileError for a body file that is missing, has changed or is
-    damaged, and ValueError for impossible rest extents.
+    Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match.
+    Raises FileError for a body file that is missing, changed or damaged, and ValueError for impossible rest extents.
     """
     folders, wanted = tuple(beside), (files.smpl, *files.uv)
     paths = [_found(file, folders) for file in wanted]
     key = tuple((file.sha256, path.suffix) for file, path in zip(wanted, paths, strict=True))
     body_setup = _loaded.pop(key, None)
     if body_setup is None:
-        smpl, *uv = (_read(path, file) for file, path in zip(wanted, paths, strict=True))
-        body_setup = _load(smpl, tuple(uv))
+        body_setup = body_setup_from_files(paths[0], tuple(paths[1:]))
     _loaded[key] = body_setup
     while len(_loaded) > _KEPT:
         del _loaded[next(iter(_loaded))]
@@ -113,67 +107,34 @@ _loaded: dict[tuple[tuple[str, str], ...], BodySetup] = {}
 """Bodies that were loaded, by the hashes and endings of their files, the last used last."""
 
 
-def _load(smpl: FileContent, uv: tuple[FileContent, ...]) -> BodySetup:
-    if not 1 <= len(uv) <= 2:
-        raise FileError(smpl, f"has {len(uv)} files of texture coordinates", "give 1 or 2")
-    body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
-    files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
-    return BodySetup(body, build_anchors(body, "released"), files)
-
-
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
     shown, name = f"{file.path!r:.120}".strip("'"), PureWindowsPath(file.path).name  # also parses POSIX paths
     named = [Path(file.path)] if is_plain_path(file.path) else []
     problem = "is missing" if named else "is not named by a path on this machine"
     for path in (*named, *(folder / name for folder in folders if name and is_plain_path(name))):
         try:
-            stamp = _Stamp.of(path)
+            status = check_regular(path)
+            digest = _known_sha256(path, status.st_mtime_ns, status.st_size)
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             continue
         except (OSError, FileError) as error:
             problem = f"cannot be read ({getattr(error, 'strerror', None) or 'it is too large'})"
             continue
-        if _sha256(stamp) == file.sha256:
+        if digest == file.sha256:
             return path
         shown, problem = f"{path!s:.120}", "has changed"
     if problem == "has changed":
-        raise _changed(shown, file)
+        reason = f"has changed (a body file, sha256 was {file.sha256[:12]}...)"
+        raise FileError(shown, reason, "restore it, or import the checkpoint again with this file")
     reason = f"{problem} (a body file, sha256 {file.sha256[:12]}...)"
     raise FileError(shown, reason, "restore it, or put a copy beside the file that refers to it")
 
 
-def _read(path: Path, file: FileFingerprint) -> FileContent:
-    """The file at `path`, read once. Raises FileError where it is not the one that `file` describes, OSError."""
-    content = read_body_file(path)
-    if content.sha256 != file.sha256:
-        raise _changed(f"{path!s:.120}", file)
-    return content
-
-
-def _changed(shown: str, file: FileFingerprint) -> FileError:
-    reason = f"has changed (a body file, sha256 was {file.sha256[:12]}...)"
-    return FileError(shown, reason, "restore it, or import the checkpoint again with this file")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Stamp:
-    """Cache key of a file; changes when the file changes."""
-
-    path: Path
-    nanoseconds: int
-    size: int
-
-    @classmethod
-    def of(cls, path: Path) -> _Stamp:
-        """Raises as `check_regular`, and FileError; FileNotFoundError for an empty file."""
-        stat = check_regular(path)
-        if not stat.st_size:  # also endless files of /proc
-            raise FileNotFoundError(errno.ENOENT, "the file is empty", str(path))
-        check_size(path, stat.st_size, LARGEST_BODY_FILE)
-        return cls(path, stat.st_mtime_ns, stat.st_size)
-
-
 @functools.lru_cache(maxsize=16)
-def _sha256(stamp: _Stamp) -> str:
-    """The hash when the file had this stamp: to find the file, not to trust it."""
-    return read_body_file(stamp.path).sha256
+def _known_sha256(path: Path, nanoseconds: int, size: int) -> str:
+    return _sha256(path)
+
+
+def _sha256(path: Path) -> str:
+    with open_regular(path, LARGEST_BODY_FILE) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

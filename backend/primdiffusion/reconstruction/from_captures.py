@@ -139,7 +139,7 @@ def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"])
         return payload
     stride = math.ceil(max(views.camera.width, views.camera.height) / DESCENT_SIDE)
     settings = dataclasses.replace(DESCENT, stride=stride, largest_density=model.config.full_density)
-    return descend(payload, seen, settings).payload
+    return descend(payload, seen, settings)
 
 
 def _shows(image: PosedView) -> bool:

@@ -21,11 +21,12 @@ from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph
-from primdiffusion.capture.reader import as_camera, views_in, windowed_view
+from primdiffusion.capture.reader import as_camera, windowed_view
 from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import FileError, as_file_error
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.capture_layout import views_in
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import matrix_to_axis_angle

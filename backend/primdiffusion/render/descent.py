@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, NamedTuple
 
@@ -61,37 +60,17 @@ class DescentSettings(Checked):
     """Weight of the mean square error of the silhouette, relative to that of the colours."""
     step: RayStep = 0.01
     """Metres between samples of a ray."""
-    seconds: Annotated[float, Range(0)] = math.inf
-    """Time limit, checked after each step; the decay of the rates does not adapt to it."""
     seed: int = 0
     """Seed of the order of views and of the offsets."""
-
-
-class DescentStep(NamedTuple):
-    """Progress after a step."""
-
-    number: int
-    """Number of completed steps, from 1."""
-    loss: float
-
-
-class Descent(NamedTuple):
-    """Result of a descent."""
-
-    payload: Payload
-    """Without gradients, on the device of the start."""
-    steps: int
-    """Completed steps; fewer than requested if time ran out."""
-    seconds: float
 
 
 def descend(
     start: Payload,
     views: Sequence[PosedView],
     settings: DescentSettings = DescentSettings(),
-    on_step: Callable[[DescentStep], None] | None = None,
-) -> Descent:
-    """Fit a payload to the views, from `start` and on its device.
+    on_step: Callable[[], None] = lambda: None,
+) -> Payload:
+    """Fit a payload to the views, from `start` and on its device; without gradients.
 
     Deterministic for the same input, settings and device. `on_step` is called after each step; an exception that it
     raises cancels.
@@ -119,7 +98,6 @@ def descend(
         return loss.detach(), *torch.autograd.grad(loss, own)
 
     recorded = Recorded(gradients)
-    began, number = time.perf_counter(), 0
     for number in range(1, settings.steps + 1):
         shown = itertools.islice(chosen, settings.views)
         loss, *found = recorded(*leaves, *itertools.chain.from_iterable(map(_tensors, shown)))
@@ -131,11 +109,8 @@ def descend(
         adam.step()
         fall.step()
         leaves.clamp_(settings.largest_density)
-        if on_step is not None:
-            on_step(DescentStep(number, value))
-        if time.perf_counter() - began > settings.seconds:
-            break
-    return Descent(leaves.result(start), number, time.perf_counter() - began)
+        on_step()
+    return leaves.result(start)
 
 
 class _Leaves(NamedTuple):

@@ -15,9 +15,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, TypeVar
 
 POLL_S = 0.2
+Result = TypeVar("Result")
 
 
 def begin_worker() -> None:
@@ -84,8 +85,8 @@ def _answer(answering: Connection, function: Callable[..., Any], arguments: tupl
 THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: int) -> Iterator[None]:
-    """Call `work(*job)` for every job, in this process or in `workers` others; yield after each finished job.
+def each(work: Callable[..., Result], jobs: Iterable[tuple[Any, ...]], workers: int) -> Iterator[Result]:
+    """Yield `work(*job)` of every job as it is finished, in this process or in `workers` others.
 
     The first error stops it: running jobs are finished, queued ones dropped. So does closing the iterator, and Ctrl-C,
     which only this process receives.
@@ -96,8 +97,7 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
     """
     if workers == 1:
         for job in jobs:
-            work(*job)
-            yield
+            yield work(*job)
         return
     context = multiprocessing.get_context("spawn")
     with _single_threaded_children():
@@ -107,8 +107,7 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
             while waiting:
                 finished, waiting = wait(waiting, timeout=1.0, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    future.result()
-                    yield
+                    yield future.result()
         except BrokenProcessPool as error:
             raise ValueError(
                 f"one of {workers} worker processes was killed, perhaps out of memory: run the command again with "

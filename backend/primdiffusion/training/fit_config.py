@@ -51,7 +51,7 @@ class FitConfig(OptimiserSettings, SampleSettings, RunSettings):
     """A run of `primdiffusion fit`."""
 
     data: Path
-    """Captures to train on; packed ones load much faster."""
+    """Captures to train on."""
     held: Path | None = None
     """Captures of held-out subjects for evaluation."""
     fitted: Path | None = None

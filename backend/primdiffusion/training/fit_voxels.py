@@ -9,6 +9,7 @@ the images, but for the products of neighbours.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import logging
 import time
 from pathlib import Path
@@ -19,7 +20,6 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
-from primdiffusion.capture.dataset import source_stamp
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, frames_of
@@ -166,8 +166,11 @@ def write_fitted(folder: Path, name: str, fitted: FittedVoxels, source: str) -> 
 
 
 def _source(subject: Subject, encoder: EncoderConfig) -> str:
-    """What voxels are made from: the images, and the settings that place boxes and look images up."""
-    return f"{source_stamp(subject)} {[getattr(encoder, name) for name in PLACING]}"
+    """What voxels are made from: the images by name and size, and the settings that place boxes and look images up."""
+    pictures = sorted(path for kind in ("img", "mask") for path in (subject.folder / kind).rglob("*.*"))
+    images = [(path.relative_to(subject.folder).as_posix(), path.stat().st_size) for path in pictures]
+    digest = hashlib.sha256(repr(images).encode()).hexdigest()
+    return f"{digest} {[getattr(encoder, name) for name in PLACING]}"
 
 
 def _stored_source(path: Path) -> str | None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,7 +18,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import Views
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.geometry.srgb import encode_srgb
@@ -29,7 +27,7 @@ from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.render.descent import DescentSettings, DescentStep, descend, render_view
+from primdiffusion.render.descent import DescentSettings, descend, render_view
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.version import __version__
@@ -50,17 +48,13 @@ class Refined:
     """Mean over up to MEASURED views, dB (`view_psnr`)."""
     psnr_after: float
     """The same after refinement."""
-    steps: int
-    """Completed steps; fewer than requested if time ran out."""
-    seconds: float
-    """Duration of the steps."""
 
 
 def refine(
     human: Human,
     views: Sequence[Views],
     settings: DescentSettings | None = None,
-    on_step: Callable[[DescentStep], None] | None = None,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Refined:
     """Return the human with the same betas and a payload optimised to match the views; runs on the payload's device.
 
@@ -75,12 +69,18 @@ def refine(
     """
     human.validate()
     scenes = scenes_of(human, views)
-    payload, steps, seconds = descend(human.payload, scenes, settings or DescentSettings(), on_step)
+    settings = settings or DescentSettings()
+    payload = descend(human.payload, scenes, settings, on_step)
     measured = scenes[:: math.ceil(len(scenes) / MEASURED)]
     before, after = (float(psnr_of(measured, candidate).mean()) for candidate in (human.payload, payload))
-    provenance = {**human.provenance, "refined_steps": steps, "refined_views": len(scenes), "version": __version__}
+    provenance = {
+        **human.provenance,
+        "refined_steps": settings.steps,
+        "refined_views": len(scenes),
+        "version": __version__,
+    }
     refined = dataclasses.replace(human, payload=payload, provenance=provenance).to("cpu").validate()
-    return Refined(refined, before, after, steps, seconds)
+    return Refined(refined, before, after)
 
 
 def view_psnr(human: Human, views: Sequence[Views]) -> Float[Tensor, "n"]:
@@ -154,20 +154,5 @@ def bare_body(betas: Float[Tensor, "n"]) -> Human:
         skin_index=np.zeros((len(body.template), 1), np.int32),
         skin_weight=np.ones((len(body.template), 1)),
     )
-    return _as_human(TexturedMesh((skin,)), betas, "the bare body")
-
-
-def meshed_person(path: str | Path) -> Human:
-    """Return a human of `primdiffusion people`, a .glb in the rest pose of the default body; takes about 3 s.
-
-    Raises:
-        FileNotFoundError, FileError: as `read_person`.
-        ValueError: the mesh is empty.
-    """
-    person = read_person(path)
-    return _as_human(person.mesh, torch.from_numpy(person.betas).float(), Path(path).name)
-
-
-def _as_human(mesh: TexturedMesh, betas: Float[Tensor, "n"], origin: str) -> Human:
-    payload = from_mesh(mesh, rest_frames(betas.double().numpy()))
-    return Human(payload, betas, {"start": origin}).validate()
+    payload = from_mesh(TexturedMesh((skin,)), rest_frames(betas.double().numpy()))
+    return Human(payload, betas, {"start": "the bare body"}).validate()

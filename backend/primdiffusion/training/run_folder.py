@@ -85,7 +85,7 @@ def begin(
         if noted.exists():
             started["starts"] = _earlier(config, people, _text(noted), processes)
         _cut_metrics(config.run / METRICS, steps)
-        remove_abandoned(config.run)
+        remove_abandoned(config.run, after_s=0)
     done = {"step": steps[""]} if "" in steps else {"steps": {phase: step for phase, step in steps.items() if step}}
     now = {**done, "processes": processes, "primdiffusion": __version__, **versions()}
     write_atomically(saved, to_json(config))

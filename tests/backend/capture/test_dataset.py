@@ -2,13 +2,12 @@
 
 import dataclasses
 import itertools
-import os
 
 import numpy as np
 import pytest
 import torch
 from capture_scenes import captured
-from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches, open_pack, pack, pack_path
+from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches
 from primdiffusion.capture.reader import Window, full_window, open_captures, resample, windowed_view
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.records import TensorRecord
@@ -49,13 +48,14 @@ def test_a_batch_holds_views_cameras_poses_and_shapes(captures):
 def test_a_sample_is_what_the_reader_reads(captures):
     sample = CaptureDataset(captures, SampleSettings(1, 3, 32, "whole", "same"))[0, 4]
     name, frame = captures.subjects[int(sample.subject)], int(sample.frame)
-    views = [captures.view(name, frame, camera) for camera in range(4)]
+    subject = captures.subject(name)
+    views = [torch.from_numpy(subject.picture("img", frame, camera)) for camera in range(4)]
     shown = torch.cat([sample.conditioning.image, sample.target.image])
-    numbers = [next(i for i, view in enumerate(views) if torch.equal(view.image, image)) for image in shown]
+    numbers = [next(i for i, view in enumerate(views) if torch.equal(view, image)) for image in shown]
     assert sorted(numbers) == [0, 1, 2, 3]
-    for view, camera in zip([views[i] for i in numbers[1:]], sample.target.camera.world_to_camera, strict=True):
-        assert torch.equal(view.camera.world_to_camera, camera)
-    assert torch.equal(sample.target.pose.joint_rotation, views[0].pose.joint_rotation)
+    for number, camera in zip(numbers[1:], sample.target.camera.world_to_camera, strict=True):
+        assert torch.equal(subject.camera(number).world_to_camera, camera)
+    assert torch.equal(sample.target.pose.joint_rotation, subject.smpl.pose(frame).joint_rotation)
 
 
 def test_conditioning_views_of_the_first_frame_show_the_near_t_pose(captures):
@@ -92,35 +92,6 @@ def test_training_goes_on_where_it_stopped_across_epochs(captures):
     again = first(4, CaptureDataset(captures, SETTINGS), start=stopped, workers=1)
     assert all(same(one, other) and at == there for (one, at), (other, there) in zip(through[4:], again, strict=True))
     assert through[4][1] == Position(1, 1)
-
-
-def test_packs_hold_the_same_samples_and_are_used(captures, monkeypatch):
-    settings = dataclasses.replace(SETTINGS, framing="crop")
-    before = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
-    assert [packing.found for packing in pack(captures)] == [False] * 3
-    assert [packing.found for packing in pack(captures)] == [True] * 3
-    monkeypatch.setattr("primdiffusion.capture.reader._read", None)  # nothing is decoded any more
-    after = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
-    assert all(same(one, other) for one, other in zip(before, after, strict=True))
-
-
-@pytest.mark.parametrize("marked", [True, False])
-def test_a_pack_of_other_pictures_is_not_used(tmp_path, marked):
-    root = captured(tmp_path, people=1, passes=("img", "mask"))
-    subject = open_captures(root).subject("person_000000")
-    if not marked:
-        (subject.folder / "complete.json").unlink()
-    list(pack(open_captures(root)))
-    assert isinstance(open_pack(subject), np.memmap)
-    changed = subject.folder / ("complete.json" if marked else "img/camera0000/0000.jpg")
-    if marked:
-        changed.write_text(changed.read_text() + " ")
-    else:
-        os.utime(changed, ns=(1, 1))
-    assert open_pack(subject) is None
-    list(pack(open_captures(root)))
-    pack_path(subject).write_bytes(pack_path(subject).read_bytes()[:-1000])
-    assert open_pack(subject) is None
 
 
 def test_a_smaller_picture_is_the_mean_of_linear_light_and_its_camera_sees_the_same():

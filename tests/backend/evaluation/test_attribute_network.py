@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from primdiffusion.evaluation.attribute_network import BANDS, detail_energies, features_of, load_attribute_network
 from primdiffusion.evaluation.distances import frechet_distance
-from primdiffusion.evaluation.gallery import PORTRAITS
+from primdiffusion.evaluation.pose_depth_network import BANDS, detail_energies
 from torch.nn import functional
 
+from scripts.feature_space.network import features_of, load_attribute_network
+from scripts.feature_space.portraits import PORTRAITS
 from scripts.train_attribute_network import (
     UNKNOWN,
     accuracies,

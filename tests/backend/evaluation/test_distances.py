@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from primdiffusion.evaluation.distances import (
-    frechet_distance,
-    frechet_uncertainty,
-    kernel_distance,
-    nearest,
-    precision_recall,
-)
-from primdiffusion.evaluation.generation import nearest_other
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
 from support.errors import refused
 from torchmetrics.image.kid import poly_mmd
+
+from scripts.feature_space.comparison import frechet_uncertainty, nearest, nearest_other, precision_recall
 
 
 def draws(count: int, width: int, seed: int, shift: float = 0.0) -> torch.Tensor:

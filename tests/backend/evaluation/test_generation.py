@@ -5,9 +5,19 @@ import json
 import pytest
 import torch
 from diffusion_people import write_people
-from primdiffusion.commands import evaluate as command
-from primdiffusion.evaluation.attribute_network import features_of
-from primdiffusion.evaluation.gallery import (
+from primdiffusion.people.assets import open_assets
+from primdiffusion.people.payloads import coloured_people, rest_frames
+from primdiffusion.people.stored_people import find_people, read_person
+from primdiffusion.primitives.from_mesh import colour, surface_field
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.training.latents import split_people
+from support.errors import refused
+from tiny_model import tiny_model
+
+from scripts.feature_space import __main__ as command
+from scripts.feature_space.comparison import COLUMNS, compare, open_reference_set, real_vs_real, table
+from scripts.feature_space.network import features_of
+from scripts.feature_space.portraits import (
     PORTRAITS,
     SIDE,
     Source,
@@ -18,16 +28,6 @@ from primdiffusion.evaluation.gallery import (
     payload_sources,
     read_seed,
 )
-from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
-from primdiffusion.people.assets import open_assets
-from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.people.stored_people import find_people, read_person
-from primdiffusion.primitives.from_mesh import colour, surface_field
-from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.training.latents import split_people
-from support.errors import refused
-from tiny_model import tiny_model
-
 from scripts.train_attribute_network import accuracies, train_reference
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -160,11 +160,10 @@ def _tiny_checkpoint(monkeypatch):
 
 @pytest.mark.usefixtures("_tiny_checkpoint")
 def test_command_compares_generated_people_and_writes_figures(people, reference, reference_folder, tmp_path, capsys):
-    line = ["generation", "--people", str(people), "--reference", str(reference_folder), "--holdout", "0.34"]
-    line += ["--count", "5", "--steps", "2", "--json", str(tmp_path / "new" / "figures.json")]
-    command.run(line)
+    out, judged = tmp_path / "figures.json", {"people": people, "reference": reference_folder, "holdout": 0.34}
+    command.main(command.Options(**judged, count=5, steps=2, json=out))
     assert "| generated | 5 |" in capsys.readouterr().out
-    figures = json.loads((tmp_path / "new" / "figures.json").read_text())
+    figures = json.loads(out.read_text())
     assert set(figures["people"]) == {"generated", "trained on"}
     assert set(figures["people"]["generated"]) == set(COLUMNS)
     held = accuracies(reference.network, reference.held_features, reference.held.attributes)
@@ -172,14 +171,12 @@ def test_command_compares_generated_people_and_writes_figures(people, reference,
 
 
 def test_command_names_the_script_that_trains_a_missing_network(people, tmp_path):
-    line = ["generation", "--people", str(people), "--reference", str(tmp_path), "--holdout", "0.34", "--count", "5"]
     with refused(FileNotFoundError, "scripts/train_attribute_network.py"):
-        command.run(line)
+        command.main(command.Options(people=people, reference=tmp_path, holdout=0.34, count=5))
     assert not list(tmp_path.iterdir())
 
 
 def test_command_rejects_too_few_people_before_it_works(people, tmp_path):
-    line = ["generation", "--people", str(people), "--reference", str(tmp_path / "judge"), "--count", "3"]
     with refused(ValueError, "more than 3"):
-        command.run(line)
+        command.main(command.Options(people=people, reference=tmp_path / "judge", count=3))
     assert not (tmp_path / "judge").exists()

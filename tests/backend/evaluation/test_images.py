@@ -7,7 +7,6 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.evaluation import images
 from primdiffusion.evaluation.images import JOINTS, SIDE, body_camera, folder_images, human_images, mesh_images
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import generate, pose_body
@@ -112,15 +111,3 @@ def test_meshes_are_drawn_around_their_joints():
     assert image.mask[row, column].all()
     side = [JOINTS.index(f"{side}_shoulder") for side in ("left", "right")]
     assert image.joints[side[0], 0] > image.joints[side[1], 0] + 20  # seen from the front
-
-
-@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
-def test_pictures_resized_in_strips_are_those_resized_whole(tmp_path, monkeypatch, mode):
-    noise = np.random.default_rng(0).integers(0, 256, (701, 701, 4), dtype=np.uint8)
-    Image.fromarray(noise).convert(mode).save(tmp_path / "a.png")
-    monkeypatch.setattr(images, "STRIP_PIXELS", 10**9)
-    whole = next(folder_images(tmp_path))
-    monkeypatch.setattr(images, "STRIP_PIXELS", 7000)
-    in_strips = next(folder_images(tmp_path))
-    assert int((whole.rgba.int() - in_strips.rgba.int())[..., :3].abs().max()) <= 1
-    assert bool((whole.mask == in_strips.mask).float().mean() > 0.9999)

@@ -187,8 +187,3 @@ def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypa
     assert records[0]["resolution"] == "256 x 256 x 8"
     assert records[0]["rows"]["floor"]["own_pckh"]["value"] == load_pose_depth_network().card["errors"]["pckh"]
     assert "| floor |" in capsys.readouterr().out
-
-
-def test_without_a_table_the_people_are_asked_for():
-    with refused(ValueError, "--people", "--reference"):
-        command.run(["generation"])

@@ -12,7 +12,6 @@ from primdiffusion.files.arrays import (
     all_finite,
     array_names,
     array_shape,
-    map_npy,
     read_arrays,
     read_npy,
     read_numbers,
@@ -86,7 +85,7 @@ def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     assert len(read_arrays(path, ("b",))["b"]) == 100
 
 
-@pytest.mark.parametrize("read", [read_npy, map_npy, array_names])
+@pytest.mark.parametrize("read", [read_npy, array_names])
 def test_folders_and_pipes_are_not_opened(tmp_path, read):
     with pytest.raises(IsADirectoryError):
         read(tmp_path)
@@ -128,12 +127,6 @@ def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
     path = npz(tmp_path / "people.npz", npy("'|u1'", "(50000000, 1024, 8, 8, 8, 4)"))
     with refused(FileError):
         array_shape(path, "pose")
-
-
-def test_a_mapped_array_may_be_larger_than_what_is_read_at_once(tmp_path, monkeypatch):
-    np.save(tmp_path / "a.npy", np.arange(12, dtype=np.uint8).reshape(3, 4))
-    monkeypatch.setattr("primdiffusion.files.arrays.LARGEST_BYTES", 10)
-    assert np.array_equal(map_npy(tmp_path / "a.npy"), np.arange(12).reshape(3, 4))
 
 
 def test_numbers_of_half_precision_are_checked_without_a_warning():

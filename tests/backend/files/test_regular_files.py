@@ -1,7 +1,7 @@
 import pickle
 
 import pytest
-from primdiffusion.files.regular_files import FileContent, FileError, as_file_error, portable_name
+from primdiffusion.files.regular_files import FileError, as_file_error, portable_name
 from support.errors import refused
 
 
@@ -37,10 +37,6 @@ def test_an_error_is_pickled_with_its_three_parts(tmp_path):
     error = pickle.loads(pickle.dumps(FileError(tmp_path, "is damaged", "write it again")))
     assert (error.path, error.reason, error.remedy) == (tmp_path, "is damaged", "write it again")
     assert str(error) == f"{tmp_path} is damaged: write it again"
-
-
-def test_of_a_file_that_was_read_before_the_path_is_kept(tmp_path):
-    assert FileError(FileContent(tmp_path / "a", b"1"), "is damaged", "write it again").path == tmp_path / "a"
 
 
 @pytest.mark.parametrize(("error", "also"), [(OSError, ()), (RuntimeError, (OSError,))])

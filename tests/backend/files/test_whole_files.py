@@ -5,39 +5,25 @@ import errno
 import json
 import math
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from primdiffusion.files import whole_files
 from primdiffusion.files.json_files import parse_json, parse_message, read_json
 from primdiffusion.files.regular_files import FileError, is_plain_path
 from primdiffusion.files.whole_files import (
     ABANDONED_AFTER_S,
-    has_ended,
-    is_abandoned,
     publish,
     remove_abandoned,
     remove_of_process,
     replacing,
     staged,
-    staged_together,
     temporary_name,
-    writer,
     written_whole,
 )
 from support.errors import refused
 from two_writers import mixed
 
 PATH = Path("x/figure.tar.gz")
-
-
-def ended() -> int:
-    """The id of a process that has ended."""
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    return child.pid
 
 
 def half_done(writing) -> None:
@@ -66,13 +52,6 @@ def test_files_of_two_processes_that_publish_at_once_are_not_mixed(tmp_path):
     assert mixed(100, tmp_path) == 0
 
 
-def test_a_folder_named_twice_is_not_waited_for(tmp_path):
-    with staged_together([tmp_path, tmp_path]) as (one, two):
-        (one / "a").write_text("a")
-        (two / "b").write_text("b")
-    assert contents(tmp_path) == {"a": "a", "b": "b"}
-
-
 def test_no_file_is_written_through_a_link_out_of_the_folder(tmp_path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "out").mkdir()
@@ -95,39 +74,23 @@ def test_an_error_leaves_an_old_folder_as_it_was_and_no_new_one(tmp_path):
 
 
 def test_a_folder_in_place_of_one_file_keeps_all_others(tmp_path):
-    (tmp_path / "two" / "b").mkdir(parents=True)
-    (tmp_path / "two" / "a").write_text("kept")
+    (tmp_path / "b").mkdir(parents=True)
+    (tmp_path / "a").write_text("kept")
     with contextlib.ExitStack() as files:
-        for aside in files.enter_context(staged_together([tmp_path / "one", tmp_path / "two"])):
-            for name in "abc":
-                (aside / name).write_text("new")
+        aside = files.enter_context(staged(tmp_path))
+        for name in "abc":
+            (aside / name).write_text("new")
         with pytest.raises(IsADirectoryError) as error:
             files.close()
-    assert error.value.filename == str(tmp_path / "two" / "b")
-    assert contents(tmp_path) == {"two/a": "kept"}
-    assert not (tmp_path / "one").exists()
+    assert error.value.filename == str(tmp_path / "b")
+    assert contents(tmp_path) == {"a": "kept"}
 
 
-def test_a_move_that_fails_is_undone(tmp_path, monkeypatch):
+def test_a_folder_replaces_a_folder(tmp_path):
     for name in ("made/a", "made/b/x", "made/c", "old/a", "old/b/y"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
-    before, replace = contents(tmp_path / "old"), os.replace
-
-    def failing(source, target):
-        if Path(source) == tmp_path / "made" / "c":
-            raise OSError(errno.EIO, "Input/output error", str(target))
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", failing)
-    with refused(OSError, "Input/output"):
-        publish([(tmp_path / "made", tmp_path / "old")])
-    assert contents(tmp_path / "old") == before
-    monkeypatch.undo()
-    for name in ("made/a", "made/b/x"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(name)
-    publish([(tmp_path / "made", tmp_path / "old")], last="a")
+    publish(tmp_path / "made", tmp_path / "old")
     assert contents(tmp_path / "old") == {"a": "made/a", "b/x": "made/b/x", "c": "made/c"}
 
 
@@ -137,52 +100,19 @@ def test_temporary_names_are_random_and_keep_the_ending():
     assert all(name.parent == PATH.parent and name.suffix == ".gz" and name.name[0] == "." for name in names)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows does not say whether a process has ended: age decides there")
-@pytest.mark.unix
-def test_what_an_ended_process_left_goes_but_not_what_a_living_one_writes(tmp_path):
-    living, dead = temporary_name(tmp_path / "files"), temporary_name(tmp_path / "files")
-    dead = dead.with_name(dead.name.replace(str(os.getpid()), str(ended())))
-    for path in (living, dead):
-        path.mkdir()
-        (path / "half").touch()
-    assert has_ended(dead.name)
-    assert not has_ended(living.name)
-    with staged(tmp_path):
-        pass
-    assert list(tmp_path.iterdir()) == [living]
-
-
-def test_elsewhere_only_age_tells_that_a_process_has_ended(tmp_path, monkeypatch):
-    """The id of a process in another container may be that of a living one here, or of an ended one."""
-    other = writer().replace(whole_files._space(), "0" * 8)
-    young, old = (tmp_path / f".files.{other[:-1]}{end}.partial" for end in "ab")
+def test_what_is_a_day_old_goes_with_the_next_writing_but_not_what_may_be_written(tmp_path):
+    young, old, other = (temporary_name(tmp_path / name) for name in ("files", "files", "other.png"))
     for path in (young, old):
         path.mkdir()
         (path / "half").touch()
-    for path in (old / "half", old):
+    other.touch()
+    for path in (old / "half", old, other):
         os.utime(path, (0, os.stat(path).st_mtime - ABANDONED_AFTER_S - 1))
-    assert (is_abandoned(young), is_abandoned(old)) == (False, True)
-    assert not has_ended(old.name)
+    with written_whole(tmp_path / "files") as path:
+        path.touch()
+    assert sorted(tmp_path.iterdir()) == sorted((young, other, tmp_path / "files"))
     remove_abandoned(tmp_path)
-    assert list(tmp_path.iterdir()) == [young]
-
-
-@pytest.mark.unix
-def test_the_next_writing_of_a_file_removes_what_a_killed_one_left(tmp_path):
-    code = (
-        "import os, signal, sys\nfrom pathlib import Path\nfrom primdiffusion.files.whole_files import *\n"
-        "with written_whole(Path(sys.argv[1])) as path:\n"
-        "    path.write_text('half')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    for name in ("picture.png", "other.png"):
-        subprocess.run([sys.executable, "-c", code, str(tmp_path / name)], check=False)
-    assert len(list(tmp_path.iterdir())) == 2
-    with written_whole(tmp_path / "picture.png") as path:
-        path.write_text("whole")
-    left = [path.name for path in tmp_path.iterdir()]
-    assert len(left) == 2
-    assert "picture.png" in left
-    assert any(name.startswith(".other.") for name in left)
+    assert sorted(tmp_path.iterdir()) == sorted((young, tmp_path / "files"))
 
 
 def test_what_a_killed_child_left_is_known_by_its_id(tmp_path):

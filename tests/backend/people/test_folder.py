@@ -1,8 +1,9 @@
-"""People folders: whole or not at all, the same everywhere, licences of all assets. Need a MakeHuman asset folder."""
+"""People folders: whole or not at all, the same everywhere. Need a MakeHuman asset folder."""
 
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,11 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
+from primdiffusion.capture.people_files import read_person
 from primdiffusion.people import folder as folder_module
 from primdiffusion.people import load_base_mesh, make_person
-from primdiffusion.people.assets import licence_of
 from primdiffusion.people.fitting import cover
-from primdiffusion.people.folder import PeopleSet, is_whole, make_people
+from primdiffusion.people.folder import PeopleSet, is_there, make_people
 from primdiffusion.people.wardrobe import SKIRTS
 from support.errors import refused
 from support.runs import within
@@ -43,7 +44,7 @@ def digests(root):
     return {path.relative_to(root): hashlib.sha256(path.read_bytes()).hexdigest() for path in root.rglob("*.*")}
 
 
-def test_manifest_lists_people_and_the_licence_of_every_asset(two):
+def test_manifest_lists_people_and_every_asset(two):
     manifest = json.loads((two / "manifest.json").read_text())
     assert (manifest["format"], manifest["version"]) == ("primdiffusion-people", 1)
     assert (manifest["seed"], manifest["count"]) == (3, 2)
@@ -56,12 +57,12 @@ def test_manifest_lists_people_and_the_licence_of_every_asset(two):
     assert any(path.endswith((".png", ".jpg")) for path in used)
 
 
-def test_damaged_people_are_made_anew_and_whole_ones_kept(assets, two):
+def test_missing_people_are_made_and_others_kept(assets, two):
     before = digests(two)
-    kept, damaged = two / "person_000003/person.glb", two / "person_000004/person.glb"
+    kept = two / "person_000003/person.glb"
     moment = kept.stat().st_mtime_ns
-    damaged.write_bytes(damaged.read_bytes()[:-7])
-    assert not is_whole(two / "person_000004", 4)
+    shutil.rmtree(two / "person_000004")
+    assert not is_there(two / "person_000004", 4)
     assert list(make_people(assets, PeopleSet(two, 3, 2), 1)) == [1, 2]
     assert digests(two) == before
     assert kept.stat().st_mtime_ns == moment
@@ -78,26 +79,6 @@ def test_other_sets_of_people_are_rejected(assets, two):
 def test_sets_without_people_are_rejected(tmp_path, seed, count, name):
     with refused(ValueError, name):
         PeopleSet(tmp_path, seed, count)
-
-
-def test_licences_are_read_from_headers_lists_and_materials(tmp_path):
-    (tmp_path / "pack/hat").mkdir(parents=True)
-    root = tmp_path / "pack"
-    (root / "hat/a.obj").write_text("# This asset was explicitly released as CC0 in september 2020.\nv 0 0 0\n")
-    (root / "hat/b.mhclo").write_text("# license CC-BY-SA 4.0\n")
-    (root / "hat/c.obj").write_text("v 0 0 0\n# CC0\n")
-    (root / "hat/d.mhmat").write_text("# released as CC0\ndiffuseTexture d_diffuse.png\n")
-    for name in ("d_diffuse.png", "e.png", "f.png"):
-        (root / "hat" / name).write_bytes(b"")
-    (tmp_path / "LICENSES.txt").write_text("Notes\npath | source | license\npack/hat/e.png | x | CC-BY-4.0 | y\n")
-    found = {name: licence_of(root, f"hat/{name}") for name in ("a.obj", "b.mhclo", "d_diffuse.png", "e.png", "f.png")}
-    assert found == {
-        "a.obj": "CC0-1.0",
-        "b.mhclo": "CC-BY-SA 4.0",
-        "d_diffuse.png": "CC0-1.0",
-        "e.png": "CC-BY-4.0",
-        "f.png": "unknown",
-    }
 
 
 def test_faces_differ_between_people_of_one_body(assets):
@@ -142,7 +123,8 @@ def test_stopped_runs_leave_whole_people_and_no_workers(assets, tmp_path, blow):
         process.wait()
     assert within(300, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
     for folder in tmp_path.glob("person_*"):
-        assert is_whole(folder, int(folder.name[-6:]))
+        assert is_there(folder, int(folder.name[-6:]))
+        assert read_person(folder / "person.glb").betas.any()
     assert not (tmp_path / "manifest.json").exists()
 
 

@@ -88,10 +88,9 @@ def test_files_of_different_size_are_rejected_with_both_counts(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
-def test_a_picture_shrunk_in_strips_is_pillows(tmp_path, monkeypatch, mode):
+def test_a_shrunk_picture_is_pillows(tmp_path, mode):
     noise = np.random.default_rng(0).integers(0, 256, (301, 207, 4), dtype=np.uint8)
     Image.fromarray(noise).convert(mode).save(tmp_path / "a.png")
-    monkeypatch.setattr("primdiffusion.geometry.pictures.STRIP_PIXELS", 5000)
     whole = Image.fromarray(noise).convert(mode).convert("RGBA").convert("RGBa")
     expected = whole.resize((50, round(301 * 50 / 207)), Image.Resampling.BOX).convert("RGBA")
     assert np.array_equal(_decoded(tmp_path / "a.png", 50), np.asarray(expected))

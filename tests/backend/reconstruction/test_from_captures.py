@@ -26,7 +26,7 @@ from primdiffusion.reconstruction.from_captures import (
     steps_of,
     targets_of,
 )
-from primdiffusion.render.descent import Descent, DescentSettings
+from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
 from support.errors import refused
@@ -194,9 +194,9 @@ def test_the_fit_draws_no_more_rays_than_an_image_of_256_pixels_has(monkeypatch)
     large = framing(place(human), 0.0, 600, 400)
     views = Views(torch.full((1, 400, 600, 4), 255, dtype=torch.uint8), stack([large]), BodyPose.rest())
 
-    def noted(start: Payload, views: list, used: DescentSettings) -> Descent:
+    def noted(start: Payload, views: list, used: DescentSettings) -> Payload:
         settings.append(used)
-        return Descent(start, 0, 0.0)
+        return start
 
     monkeypatch.setattr(from_captures, "descend", noted)
     model = tiny_encoder()

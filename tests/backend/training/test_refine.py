@@ -65,7 +65,6 @@ def test_a_person_comes_to_look_like_the_pictures_and_like_those_it_was_not_show
     unseen = [views_of(person(1), (FRONT + 11, BACK + 11), turn=-0.4)]
     before = float(view_psnr(start, unseen).mean())
     refined = refine(start, views, QUICK)
-    assert refined.steps == 15
     assert refined.psnr_after > refined.psnr_before + 3
     assert float(view_psnr(refined.human, unseen).mean()) > before + 0.5
     assert refined.psnr_after == pytest.approx(float(view_psnr(refined.human, views).mean()), abs=1e-4)
@@ -116,23 +115,20 @@ def test_masks_alone_make_a_thin_person_in_black_solid():
     assert torch.equal(without.density, thin.payload.density)
 
 
-def test_the_work_ends_when_time_is_over_and_when_its_owner_says_so(views):
-    assert refine(person(2), views, dataclasses.replace(QUICK, seconds=0)).steps == 1
-
+def test_the_work_ends_when_its_owner_says_so(views):
     class Cancelled(Exception):
         pass
 
     seen = []
 
-    def stop(step):
-        seen.append(step)
-        if step.number == 2:
+    def stop():
+        seen.append(None)
+        if len(seen) == 2:
             raise Cancelled
 
     with pytest.raises(Cancelled):
         refine(person(2), views, QUICK, stop)
-    assert [step.number for step in seen] == [1, 2]
-    assert all(math.isfinite(step.loss) for step in seen)
+    assert len(seen) == 2
 
 
 @pytest.mark.parametrize(
@@ -153,7 +149,7 @@ def test_what_cannot_be_refined_is_rejected_in_a_sentence(views, broken, sentenc
         refine(*broken(person(2), views[0]), QUICK)
 
 
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"views": 0}, {"seconds": math.nan}, {"colour_rate": -1}])
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"views": 0}, {"last_rate": math.nan}, {"colour_rate": -1}])
 def test_impossible_settings_are_rejected(wrong):
     with refused(ValueError, next(iter(wrong))):
         DescentSettings(**wrong)
@@ -223,10 +219,9 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, fails, monkeypatch):
     ("change", "sentence"),
     [
         (("--subject", "nobody"), "no subject 'nobody'"),
-        (("--start", "missing.glb"), "missing.glb"),
+        (("--start", "missing.human"), "missing.human"),
         (("--hold-out-cameras", "4"), "cannot be held out"),
         (("--size", "0"), "size is 0"),
-        (("--minutes", "-1"), "seconds"),
     ],
 )
 def test_the_command_rejects_in_one_sentence(line, tmp_path, fails, change, sentence):

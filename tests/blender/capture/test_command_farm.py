@@ -12,7 +12,7 @@ import numpy as np
 import psutil
 import pytest
 import scan_fixtures
-from blender_primdiffusion.formats.capture_repair import verify
+from support.capture_files import faults
 
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.formats import capture_layout
@@ -50,7 +50,7 @@ def test_a_killed_workers_person_is_finished_by_another_and_no_view_is_lost_or_d
     assert process.returncode == 0, output
     assert killed in NAMES
     assert sorted(line.split()[1] for line in output.splitlines() if "/3 " in line) == sorted(NAMES)
-    assert verify(out) == {}
+    assert not faults(out)
     assert len(list(out.glob("*/img/*/*.jpg"))) == 3 * 2 * 4
     assert all(path.stat().st_ino == inode for path, inode in written.items()), "a whole view was rendered again"
     assert (out / capture_layout.LIST_FILE).read_text().split() == list(NAMES)

@@ -1,4 +1,4 @@
-"""Outputs of trackers of people and of Kimodo: one level down, several people, frame by frame, of joblib and pickle."""
+"""Outputs of trackers of people: one level down, several people, frame by frame, of joblib and pickle."""
 
 import json
 import pickle
@@ -8,12 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from blender_primdiffusion.files.regular_files import FileError
-from blender_primdiffusion.formats.joints import JOINT_NAMES
-from blender_primdiffusion.formats.poses import soma
 from blender_primdiffusion.formats.poses.files import read_motion
-from blender_primdiffusion.formats.poses.rigs import map_bones
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle
-from blender_primdiffusion.formats.poses.skeleton import chain, joint_positions
 from support.errors import refused
 from support.joblib_files import dumped
 
@@ -163,58 +159,3 @@ def test_torchs_files_are_refused_with_what_to_save(tmp_path):
     (tmp_path / "hmr4d_results.pt").write_bytes(b"PK")
     with refused(FileError, "hmr4d_results.pt", "PyTorch", ".npz"):
         read_motion(tmp_path / "hmr4d_results.pt")
-
-
-def kimodo(count: int) -> dict[str, np.ndarray]:
-    """Kimodo's arrays of THETA[0] with straight wrists' ends, of SOMA's 77 or 30 joints or SMPL-X' 22."""
-    rotations = without_hands()
-    world, joints = chain(rotations), joint_positions(rotations, MOVE)
-    if count == 22:
-        return {"local_rot_mats": rotations[:, :22], "global_rot_mats": world[:, :22], "posed_joints": joints[:, :22]}
-    bones = map_bones(soma.REST)
-    of_smpl = {bone: joint for joint, bone in bones.joints.items()} | {"Neck2": "neck"}
-    turns, places = np.tile(np.eye(3), (FRAMES, count, 1, 1)), np.zeros((FRAMES, count, 3))
-    for number, name in enumerate(soma.JOINTS[count]):
-        hand = name.removesuffix("HandMiddleEnd").lower()
-        if name in of_smpl:
-            joint = JOINT_NAMES.index(of_smpl[name])
-            turns[:, number], places[:, number] = world[:, joint], joints[:, joint]
-        elif hand in ("left", "right"):
-            turns[:, number] = world[:, JOINT_NAMES.index(f"{hand}_wrist")]
-            places[:, number] = joints[:, JOINT_NAMES.index(f"{hand}_hand")]
-    return {"local_rot_mats": turns, "global_rot_mats": turns, "posed_joints": places}
-
-
-def without_hands() -> np.ndarray:
-    rotations = from_axis_angle(THETA[0])
-    rotations[:, 22:] = np.eye(3)
-    return rotations
-
-
-@pytest.mark.parametrize("count", [77, 30, 22])
-def test_kimodos_motion_is_read(tmp_path, count):
-    np.savez(tmp_path / "walk.npz", **{key: array.astype(np.float32) for key, array in kimodo(count).items()})
-    motion = read_motion(tmp_path / "walk.npz")
-    np.testing.assert_allclose(motion.rotations, without_hands(), atol=1e-5)
-    np.testing.assert_allclose(motion.translations, MOVE, atol=1e-5)
-    assert motion.detected.rig == ("SMPL-X" if count == 22 else "SOMA")
-    assert all(len(names) == number for number, names in soma.JOINTS.items())
-
-
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        (lambda arrays: arrays.pop("posed_joints"), "'posed_joints'"),
-        (lambda arrays: arrays.update(global_rot_mats=np.zeros((2, 34, 3, 3))), "34"),
-        (lambda arrays: arrays.update(posed_joints=np.zeros((FRAMES, 30, 3))), "posed_joints"),
-        (lambda arrays: arrays.update(posed_joints=np.zeros((2, 77, 3))), "2 of posed_joints"),
-        (lambda arrays: arrays.update(posed_joints=np.zeros((FRAMES, 77, 3))), "no human"),
-        (lambda arrays: arrays.update(global_rot_mats=arrays["global_rot_mats"] * 2), "not a rotation"),
-    ],
-)
-def test_kimodos_arrays_that_do_not_fit_are_one_sentence(tmp_path, change, name):
-    arrays = kimodo(77)
-    change(arrays)
-    np.savez(tmp_path / "walk.npz", **arrays)
-    with refused(FileError, "walk.npz", name):
-        read_motion(tmp_path / "walk.npz")

@@ -1,5 +1,5 @@
-"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, trackers, SAM 3D Body, Kimodo; and
-the writer of AMASS."""
+"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, trackers, SAM 3D Body; and the writer
+of AMASS."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ...files.json_files import read_json
 from ...files.regular_files import FileError, read_regular
 from ...files.smpl_pickle import Inert, as_array, load_restricted
 from ...files.whole_files import replacing
-from . import mhr, soma
+from . import mhr
 from .bvh import read_bvh
 from .motion import (
     DEFAULT_FPS,
@@ -52,7 +52,7 @@ _ROOT, _REST = ("global_orient", "root_orient"), ("body_pose", "pose_body")
 _TRANSLATIONS = ("trans_world", "trans", "transl", "translation")
 POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *RATES)
 """Names of arrays in pose files."""
-_KEYS = tuple(dict.fromkeys((*POSE_KEYS, *mhr.KEYS, *soma.KEYS)))
+_KEYS = tuple(dict.fromkeys((*POSE_KEYS, *mhr.KEYS)))
 _HOLDING = (*_POSES, *_REST, *mhr.POSES)
 """Arrays of which a person has at least one."""
 ENDINGS = (".npz", ".npy", ".json", ".pkl", ".bvh")
@@ -79,7 +79,7 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
     - .pkl: a dictionary of such arrays, as estimators of SMPL write it, joblib too; nothing in it is run
       (`smpl_pickle`).
     - .pkl and .json of trackers, of several people or frame by frame: see `people`.
-    - .npz, .json and .pkl of SAM 3D Body: see `mhr`; .npz of Kimodo: see `soma`.
+    - .npz, .json and .pkl of SAM 3D Body: see `mhr`.
     - .bvh: any rig that `rigs` knows.
 
     Without a frame rate it is `DEFAULT_FPS`, with a note. Raises FileError where there is no such file, or it
@@ -118,11 +118,9 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     """The motion of arrays of a file, axes unchanged. Raises FileError, and OSError where there is no such file.
 
-    Their names are `POSE_KEYS`, `mhr.KEYS` or `soma.KEYS`.
+    Their names are `POSE_KEYS` or `mhr.KEYS`.
     """
     check_motion_size(path, max((array.size for array in arrays.values()), default=0))
-    if soma.holds_some(arrays):
-        return soma.motion_of(arrays, path)
     if mhr.ROTATIONS in arrays or (mhr.holds_some(arrays) and not _holds_smpl(arrays)):
         return mhr.motion_of(arrays, path)
     return motion_from_numbers(arrays, str(path))
@@ -174,7 +172,7 @@ def _holds_smpl(arrays: Mapping[str, NDArray]) -> bool:
 def _read_npz(path: Path) -> dict[str, NDArray]:
     names = array_names(path)
     arrays = read_arrays(path, optional=_KEYS)
-    if not (_holds_smpl(arrays) or mhr.holds_some(arrays) or soma.holds_some(arrays)):
+    if not (_holds_smpl(arrays) or mhr.holds_some(arrays)):
         if "smpl" in names:
             raise FileError(path, "holds pickled objects, which are never read", "use the version with plain arrays")
         remedy = "give a file with 'poses', or with 'global_orient' and 'body_pose'"

@@ -119,9 +119,9 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     names = _names(arrays.get(NAMES), path)
     numbers = {key: array for key, array in arrays.items() if key in (ROTATIONS, PLACES, CAMERA, *RATES)}
     check_numbers(numbers, str(path))
-    turns = frames_of(arrays[ROTATIONS], (len(names), 3, 3), ROTATIONS, path)
-    places = frames_of(arrays[PLACES], (len(names), 3), PLACES, path)
-    camera = frames_of(arrays.get(CAMERA, np.zeros(3)), (3,), CAMERA, path)
+    turns = _frames_of(arrays[ROTATIONS], (len(names), 3, 3), ROTATIONS, path)
+    places = _frames_of(arrays[PLACES], (len(names), 3), PLACES, path)
+    camera = _frames_of(arrays.get(CAMERA, np.zeros(3)), (3,), CAMERA, path)
     if len(places) != len(turns) or len(camera) not in (1, len(turns)):
         raise FileError(
             path,
@@ -139,7 +139,7 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     bones = map_bones(REST)
     turned = {bone: world[_TURNS.get(bone, bone)] @ REST[_TURNS.get(bone, bone)][1].T for bone in bones.joints.values()}
     try:
-        rotations, from_file = retarget(bones, places_at_rest(REST, world, at), turned)
+        rotations, from_file = retarget(bones, _places_at_rest(REST, world, at), turned)
     except ValueError as e:
         raise FileError(path, f"has joints of no human ({e})", "save the poses again") from e
     pelvis = (at["root"] + camera * Y_UP) @ from_file.T
@@ -162,7 +162,7 @@ def _names(given: NDArray | None, path: Path) -> list[str]:
     return names
 
 
-def frames_of(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> NDArray[np.float64]:
+def _frames_of(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> NDArray[np.float64]:
     """Numbers of one frame or many as those of many [F, *shape]."""
     values = values if values.ndim > len(shape) else values[None]
     if values.shape[1:] != shape:
@@ -171,7 +171,7 @@ def frames_of(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> 
     return np.asarray(values, np.float64)
 
 
-def places_at_rest(
+def _places_at_rest(
     rest: Mapping[str, tuple[str, NDArray]], world: Mapping[str, NDArray], at: Mapping[str, NDArray]
 ) -> dict[str, NDArray[np.float64]]:
     """Places of joints [3] at rest: each is fixed to its parent, on average over the frames.

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Int, UInt8
-from torch import Tensor
-
 from primdiffusion.evaluation.images import image_over
 from primdiffusion.files.arrays import read_arrays
 from primdiffusion.files.json_files import parse_json
@@ -28,6 +26,7 @@ from primdiffusion.people.stored_people import read_outline, read_person
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.march import MarchSettings, march
+from torch import Tensor
 
 SIDE = 256
 """Width and height of a portrait, pixels: enough to see whether a face is sharp."""
@@ -84,7 +83,7 @@ def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
 
 
-Report = Callable[[int, int], None]
+Report = Callable[[int, int], object]
 """Progress callback: done, total."""
 
 

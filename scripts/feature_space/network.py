@@ -13,21 +13,19 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor, nn
-from torch.nn import functional
-
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.evaluation.gallery import PORTRAITS
+from primdiffusion.evaluation.pose_depth_network import BANDS, attribute_heads, detail_energies
 from primdiffusion.files import tensor_file
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
+from torch import Tensor, nn
+
+from scripts.feature_space.portraits import PORTRAITS
 
 FEATURES = 96
 WIDTHS = (16, 32, 64, 96, 96)
 POOLED = 3
 """Side of the last feature map after pooling."""
-BANDS = (1.0, 2.0, 4.0)
-"""Standard deviations, in pixels, of the Gaussians whose differences are bands of detail: finer than each."""
 
 
 class AttributeNetwork(nn.Module):
@@ -67,38 +65,6 @@ class AttributeNetwork(nn.Module):
         """Learned features of portraits."""
         values = pictures.movedim(-1, -3).flatten(0, 1).float() / 255 - 0.25
         return self.features(self.trunk(values).unflatten(0, pictures.shape[:2]).flatten(1))
-
-
-def attribute_heads(vocabulary: AttributeVocabulary, features: int) -> nn.ModuleDict:
-    """A linear layer for each attribute: logits of a category's values, or a standardised scalar."""
-    sizes = {name: len(values) for name, values in vocabulary.categories.items()} | dict.fromkeys(vocabulary.scalars, 1)
-    return nn.ModuleDict({name: nn.Linear(features, size) for name, size in sizes.items()})
-
-
-def detail_energies(pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n d"]:
-    """Logarithm of the energy of each band of detail inside each portrait's figure, away from its outline."""
-    rgba = pictures.flatten(0, 1).float() / 255
-    alpha = rgba[..., 3]
-    image = (rgba[..., :3].mean(-1) + 0.5 * (1 - alpha))[:, None]
-    energies, finer = [], image
-    for sigma in BANDS:
-        coarser = _blurred(image, sigma)
-        reach = round(3 * sigma)
-        outside = -alpha[:, None]
-        for size, padding in (((1, 2 * reach + 1), (0, reach)), ((2 * reach + 1, 1), (reach, 0))):
-            outside = functional.max_pool2d(outside, size, stride=1, padding=padding)
-        inside = outside < -0.95
-        energy = ((finer - coarser).square() * inside).sum((1, 2, 3)) / inside.sum((1, 2, 3)).clamp_min(1)
-        energies.append((energy + 1e-7).log())
-        finer = coarser
-    return torch.stack(energies, dim=1).reshape(len(pictures), -1)
-
-
-def _blurred(images: Float[Tensor, "n 1 h w"], sigma: float) -> Float[Tensor, "n 1 h w"]:
-    offset = torch.arange(-round(3 * sigma), round(3 * sigma) + 1)
-    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
-    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, -1)
-    return functional.conv2d(functional.conv2d(images, kernel, padding="same"), kernel.mT, padding="same")
 
 
 def features_of(network: AttributeNetwork, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n f"]:
