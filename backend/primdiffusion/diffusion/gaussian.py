@@ -111,7 +111,8 @@ class PersonPrior(PersonComponents):
         Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01;
         on the CPU for Apple GPUs, which have no float64.
         """
-        log_weights, blocks = _double(self.log_weights(condition)).flatten(1).expand(len(y), -1), self._blocks
+        real, blocks = self._real_kinds
+        log_weights = _double(self.log_weights(condition)).flatten(1)[:, real].expand(len(y), -1)
         if condition is not None:
             possible = (log_weights > IMPOSSIBLE / 2).any(0).nonzero()[:, 0]
             log_weights, blocks = log_weights[:, possible], (blocks[0].chosen(possible), blocks[1].chosen(possible))
@@ -123,29 +124,33 @@ class PersonPrior(PersonComponents):
 
     def kind_shares(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b g m"]:
         """Probability of each kind given clean person coefficients."""
-        weights = _double(self.log_weight).flatten()[None]
+        real, blocks = self._real_kinds
+        weights = _double(self.log_weight).flatten()[None, real]
         one = torch.ones(len(c), 1, device=c.device)
-        shares = [
-            posterior(self._blocks, weights, *(_double(each) for each in chunk))[0]
+        found = [
+            posterior(blocks, weights, *(_double(each) for each in chunk))[0]
             for chunk in zip(*(each.split(TOGETHER) for each in (c, one, CLEAN_NOISE * one)), strict=True)
         ]
-        return torch.cat(shares).unflatten(1, self.log_weight.shape)
+        shares = torch.zeros(len(c), self.log_weight.numel()).to(found[0])
+        shares[:, real] = torch.cat(found)
+        return shares.unflatten(1, self.log_weight.shape)
 
     @functools.cached_property
-    def _blocks(self) -> tuple[Block, Block]:
-        """Clothes and heads of all kinds."""
-        inner, kinds = self.axes.shape[2], self.log_weight.numel()
-        centre = _double(self.centre).flatten(0, 1)
-        group = torch.arange(kinds, device=centre.device) // self.head.shape[1]
+    def _real_kinds(self) -> tuple[Int[Tensor, "n"], tuple[Block, Block]]:
+        """Places of kinds that are not padding, with their clothes and heads."""
+        inner = self.axes.shape[2]
+        real = _double(self.log_weight).flatten().gt(IMPOSSIBLE / 2).nonzero()[:, 0]
+        centre = _double(self.centre).flatten(0, 1)[real]
+        group = real // self.head.shape[1]
         clothes = Block.of_kinds(
             _double(self.axes), _double(self.variance), _double(self.left), _double(self.shared), group,
             centre[:, :inner],
         )  # fmt: skip
         heads = Block.of_kinds(
             _double(self.head_axes), _double(self.head_variance), _double(self.head_left), _double(self.head_shared),
-            self.head.flatten().to(centre.device), centre[:, inner:],
+            self.head.flatten().to(centre.device)[real], centre[:, inner:],
         )  # fmt: skip
-        return clothes, heads
+        return real, (clothes, heads)
 
     def denoise_rest(self, rest: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b c h w"]:
         """E[r | rest = signal r + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""

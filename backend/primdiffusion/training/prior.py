@@ -71,15 +71,17 @@ def fit_mixture(
     bare = torch.tensor([style is None for style in styles])
     of_group = [garments[rows[0].index(group)] for group in choices[0]]
     covariances = _covariances(remainder[bare, :clothes], list(compress(rows[0], bare)), choices[0], of_group, config)
-    hair = {None: HangingHair(torch.eye(clothes), skin[0, :0], skin_of_head[:0])}
-    head_shared = skin_of_head.expand(len(choices[1]), -1, -1)
+    hair: dict[str | None, HangingHair] = {}
     for style in sorted(set(filter(None, styles))):
         own = torch.tensor([each == style for each in styles])
         hair[style], remainder[own, clothes:] = find_hanging_hair(
             remainder[bare, :clothes], remainder[own], inside, config.shared
         )
-        alike = torch.tensor([each == style for each in style_of])
-        head_shared = torch.cat([head_shared, alike[:, None, None] * hair[style].of_head], dim=1)
+    directions = len(next(iter(hair.values())).of_head) if hair else 0
+    hair[None] = HangingHair(
+        torch.eye(clothes), torch.zeros(directions, clothes), torch.zeros(directions, c.shape[1] - clothes)
+    )
+    head_shared = torch.stack([torch.cat([skin_of_head, hair[style].of_head]) for style in style_of])
     head_axes = _axes(_covariances(remainder[:, clothes:], rows[1], choices[1], choices[1], config), config)
     below = [
         (g, style, kinds)
@@ -90,12 +92,7 @@ def fit_mixture(
         ])
     ]  # fmt: skip
     axes = _axes([hair[style].through.T @ covariances[g] @ hair[style].through for g, style, _ in below], config)
-    shared = torch.stack(
-        [
-            torch.cat([skin[g] @ hair[own].through, *(hair[each].of_clothes * (each == own) for each in hair)])
-            for g, own, _ in below
-        ]
-    )
+    shared = torch.stack([torch.cat([skin[g] @ hair[style].through, hair[style].of_clothes]) for g, style, _ in below])
     size = len(below), max(len(kinds) for *_, kinds in below)
     log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
     centre, kind = torch.zeros(*size, c.shape[1]), torch.zeros(*size, condition.shape[1])
