@@ -81,7 +81,8 @@ def prior_of_parts(seed: int, asked: int = 0) -> PersonPrior:
         head_axes=torch.linalg.qr(normal(heads, 4, 3))[0].mT,
         head_variance=0.5 + uniform(heads, 3),
         head_left=0.1 + 0.2 * uniform(heads),
-        shared=normal(1, 2, 6).repeat(groups, 1, 1) + torch.nn.functional.pad(normal(groups, 2, 2), (0, 4)),
+        shared=normal(groups, 2, 2),
+        head_shared=normal(heads, 2, 4),
         kind=kind.view(groups, kinds, asked),
     )
 

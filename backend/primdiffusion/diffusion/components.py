@@ -40,7 +40,7 @@ class PersonComponents(TensorRecord):
     def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
         """Return the contribution of person coefficients to latents, without the mean."""
         own = coefficients.unflatten(1, (-1, len(self.basis))).unbind(1)
-        drawn = cat([part @ basis.flatten(1) for part, basis in zip(own, self._bases(), strict=True)], dim=1)
+        drawn = cat([part @ basis.flatten(1) for part, basis in zip(own, self.bases(), strict=True)], dim=1)
         channels = self.basis.shape[2]
         picture = coefficients.new_zeros((len(coefficients), *self.mean.flatten(1).shape))
         picture[:, :channels, self._order] = drawn.unflatten(1, (-1, channels)).mT
@@ -48,23 +48,21 @@ class PersonComponents(TensorRecord):
 
     def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
         cells = z.flatten(2)[:, : self.basis.shape[2], self._order].mT
-        own = cells.split([basis.shape[1] for basis in self._bases()], dim=1)
-        return cat(
-            [part.flatten(1) @ basis.flatten(1).T for part, basis in zip(own, self._bases(), strict=True)], dim=1
-        )
+        own = cells.split([basis.shape[1] for basis in self.bases()], dim=1)
+        return cat([part.flatten(1) @ basis.flatten(1).T for part, basis in zip(own, self.bases(), strict=True)], dim=1)
 
     @property
     def _order(self) -> Int[Tensor, "k"]:
         return self.part.argsort(stable=True)
 
-    def _bases(self) -> tuple[Tensor, ...]:
+    def bases(self) -> tuple[Tensor, ...]:
         """The components of each part [n, cells, d]."""
         return self.basis.split(self.part.bincount().tolist(), dim=1)
 
     def picture_variance(self, variance: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
         """Variance of `picture` for independent coefficients of these variances."""
         own = variance.unflatten(0, (-1, len(self.basis)))
-        drawn = cat([einsum("nkd,n->kd", basis.square(), part) for part, basis in zip(own, self._bases(), strict=True)])
+        drawn = cat([einsum("nkd,n->kd", basis.square(), part) for part, basis in zip(own, self.bases(), strict=True)])
         picture = zeros_like(self.mean).flatten(1)
         picture[: drawn.shape[1], self._order] = drawn.T
         return picture.view_as(self.mean)

@@ -12,8 +12,9 @@ shoes:
     c = centre of the kind + clothes + head + u shared,    u ~ N(0, 1)
 
 `clothes` are Gaussian over all parts but the head, with a covariance for each group (an outfit of a sex, plain or
-patterned), `head` is one with a covariance for each hair style, and `shared` are directions that join the two, such as
-the tone of the skin. Kinds are many, with few people each, so what is common to a group is computed once.
+patterned, bare or below a style of hair that hangs over it), `head` is one with a covariance for each hair style, and
+`shared` are directions that join the two: the tone of the skin, and the colour of hanging hair. Kinds are many, with
+few people each, so what is common to a group is computed once.
 """
 
 from __future__ import annotations
@@ -60,9 +61,10 @@ class PersonPrior(PersonComponents):
     """Principal axes of each head, among the last s = R - o coefficients; s may be 0."""
     head_variance: Float[Tensor, "f e"]
     head_left: Float[Tensor, "f"]
-    shared: Float[Tensor, "g q r"]
-    """Directions that clothes and head share in each group, as long as their standard deviations; the head's are those
-    of the first group."""
+    shared: Float[Tensor, "g q o"]
+    """Directions that the clothes of each group share with the head, as long as their standard deviations."""
+    head_shared: Float[Tensor, "f q s"]
+    """The same of each head."""
     kind: Float[Tensor, "g m x"]
     """The condition (`AttributeVocabulary.encode`) of each kind; x may be 0."""
 
@@ -87,7 +89,7 @@ class PersonPrior(PersonComponents):
             log_weight=log_weight, centre=centre, axes=axes, variance=variance, left=variance.new_zeros(groups),
             head=torch.zeros(log_weight.shape, dtype=torch.int64), head_axes=axes.new_zeros(1, 0, 0),
             head_variance=axes.new_zeros(1, 0), head_left=axes.new_zeros(1),
-            shared=axes.new_zeros(groups, 0, len(parity)), kind=kind,
+            shared=axes.new_zeros(groups, 0, len(parity)), head_shared=axes.new_zeros(1, 0, 0), kind=kind,
         )  # fmt: skip
 
     def log_weights(self, condition: Float[Tensor, "b x"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
@@ -109,7 +111,8 @@ class PersonPrior(PersonComponents):
         Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01;
         on the CPU for Apple GPUs, which have no float64.
         """
-        log_weights, blocks = _double(self.log_weights(condition)).flatten(1).expand(len(y), -1), self._blocks
+        real, blocks = self._real_kinds
+        log_weights = _double(self.log_weights(condition)).flatten(1)[:, real].expand(len(y), -1)
         if condition is not None:
             possible = (log_weights > IMPOSSIBLE / 2).any(0).nonzero()[:, 0]
             log_weights, blocks = log_weights[:, possible], (blocks[0].chosen(possible), blocks[1].chosen(possible))
@@ -121,30 +124,33 @@ class PersonPrior(PersonComponents):
 
     def kind_shares(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b g m"]:
         """Probability of each kind given clean person coefficients."""
-        weights = _double(self.log_weight).flatten()[None]
+        real, blocks = self._real_kinds
+        weights = _double(self.log_weight).flatten()[None, real]
         one = torch.ones(len(c), 1, device=c.device)
-        shares = [
-            posterior(self._blocks, weights, *(_double(each) for each in chunk))[0]
+        found = [
+            posterior(blocks, weights, *(_double(each) for each in chunk))[0]
             for chunk in zip(*(each.split(TOGETHER) for each in (c, one, CLEAN_NOISE * one)), strict=True)
         ]
-        return torch.cat(shares).unflatten(1, self.log_weight.shape)
+        shares = torch.zeros(len(c), self.log_weight.numel()).to(found[0])
+        shares[:, real] = torch.cat(found)
+        return shares.unflatten(1, self.log_weight.shape)
 
     @functools.cached_property
-    def _blocks(self) -> tuple[Block, Block]:
-        """Clothes and heads of all kinds."""
-        inner, kinds = self.axes.shape[2], self.log_weight.numel()
-        centre, shared = _double(self.centre).flatten(0, 1), _double(self.shared)
-        group = torch.arange(kinds, device=centre.device) // self.head.shape[1]
+    def _real_kinds(self) -> tuple[Int[Tensor, "n"], tuple[Block, Block]]:
+        """Places of kinds that are not padding, with their clothes and heads."""
+        inner = self.axes.shape[2]
+        real = _double(self.log_weight).flatten().gt(IMPOSSIBLE / 2).nonzero()[:, 0]
+        centre = _double(self.centre).flatten(0, 1)[real]
+        group = real // self.head.shape[1]
         clothes = Block.of_kinds(
-            _double(self.axes), _double(self.variance), _double(self.left),
-            shared[..., :inner], group, centre[:, :inner],
+            _double(self.axes), _double(self.variance), _double(self.left), _double(self.shared), group,
+            centre[:, :inner],
         )  # fmt: skip
         heads = Block.of_kinds(
-            _double(self.head_axes), _double(self.head_variance), _double(self.head_left),
-            shared[:1, :, inner:].repeat(len(self.head_left), 1, 1),
-            self.head.flatten().to(centre.device), centre[:, inner:],
+            _double(self.head_axes), _double(self.head_variance), _double(self.head_left), _double(self.head_shared),
+            self.head.flatten().to(centre.device)[real], centre[:, inner:],
         )  # fmt: skip
-        return clothes, heads
+        return real, (clothes, heads)
 
     def denoise_rest(self, rest: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b c h w"]:
         """E[r | rest = signal r + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""
@@ -166,7 +172,8 @@ class PersonPrior(PersonComponents):
         heads = torch.zeros_like(self.head_left).index_add(0, self.head.flatten(), weight.flatten())
         clothes = torch.einsum("g,gi->i", weight.sum(1), _diagonal(self.axes, self.variance, self.left))
         head = torch.einsum("f,fi->i", heads, _diagonal(self.head_axes, self.head_variance, self.head_left))
-        return torch.cat([clothes, head]) + torch.einsum("g,gqr->r", weight.sum(1), self.shared.square()) + between
+        pairs, share = self._pairs()
+        return torch.cat([clothes, head]) + torch.einsum("n,nqr->r", share, self.shared_by(*pairs).square()) + between
 
     def sample(
         self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 x"] | None = None
@@ -181,7 +188,7 @@ class PersonPrior(PersonComponents):
         group, head = kinds // self.head.shape[1], self.head.flatten()[kinds]
         clothes = _drawn(normal, self.axes[group], self.variance[group], self.left[group])
         heads = _drawn(normal, self.head_axes[head], self.head_variance[head], self.head_left[head])
-        shared = torch.einsum("bq,bqr->br", normal(count, self.shared.shape[1]), self.shared[group])
+        shared = torch.einsum("bq,bqr->br", normal(count, self.shared.shape[1]), self.shared_by(group, head))
         coefficients = self.centre.flatten(0, 1)[kinds] + shared + torch.cat([clothes, heads], dim=1)
         return self.join(coefficients, self.rest_variance.sqrt() * normal(count, *self.mean.shape))
 
@@ -195,6 +202,18 @@ class PersonPrior(PersonComponents):
         weight = self.log_weights(condition)[0].flatten().softmax(0)
         drawn = torch.multinomial(weight.to(generator.device), count, replacement=True, generator=generator)
         return drawn.to(self.mean.device)
+
+    def shared_by(self, group: Int[Tensor, "n"], head: Int[Tensor, "n"]) -> Float[Tensor, "n q r"]:
+        """Directions that clothes of these groups share with these heads."""
+        return torch.cat([self.shared[group], self.head_shared[head]], dim=2)
+
+    def _pairs(self) -> tuple[tuple[Int[Tensor, "n"], Int[Tensor, "n"]], Float[Tensor, "n"]]:
+        """Groups and heads that kinds put together, and the share of each pair."""
+        heads = len(self.head_left)
+        pair = torch.arange(len(self.head), device=self.head.device)[:, None] * heads + self.head
+        share = torch.bincount(pair.flatten(), self.log_weight.exp().flatten())
+        found = share.nonzero()[:, 0]
+        return (found // heads, found % heads), share[found].to(self.mean)
 
     def heads_of(self, group: int) -> list[int]:
         """The heads that kinds of a group have."""
@@ -210,10 +229,12 @@ class PersonPrior(PersonComponents):
         mean, inner = weight @ centre, self.axes.shape[2]
         own = self.variance[group].sqrt()[:, None] * self.axes[group]
         of_heads = ((heads[:, None] * self.head_variance).sqrt()[..., None] * self.head_axes)[heads > 0].flatten(0, 1)
+        present = heads.nonzero()[:, 0]
+        shared = heads[present].sqrt()[:, None, None] * self.shared_by(torch.full_like(present, group), present)
         rows = [
             functional.pad(own, (0, len(mean) - inner)),
             functional.pad(of_heads, (inner, 0)),
-            self.shared[group],
+            shared.flatten(0, 1),
             weight.sqrt()[:, None] * (centre - mean),
         ]
         factor = torch.cat(rows)
@@ -232,7 +253,9 @@ class PersonPrior(PersonComponents):
         mean = torch.einsum("gm,gmr->r", weight, self.centre)
         offset = (self.centre - mean).flatten(0, 1)
         covariance = offset.T @ (weight.flatten()[:, None] * offset)
-        covariance += torch.einsum("g,gqi,gqj->ij", weight.sum(1), self.shared, self.shared)
+        pairs, share = self._pairs()
+        shared = (share.sqrt()[:, None, None] * self.shared_by(*pairs)).flatten(0, 1)
+        covariance += shared.T @ shared
         inner = self.axes.shape[2]
         heads = torch.zeros_like(self.head_left).index_add(0, self.head.flatten(), weight.flatten())
         covariance[:inner, :inner] += _pooled(weight.sum(1), self.axes, self.variance, self.left)
@@ -249,7 +272,8 @@ class PersonPrior(PersonComponents):
             head_axes=self.head_axes[:1, :0, :0],
             head_variance=self.head_variance[:1, :0],
             head_left=self.head_left[:1],
-            shared=self.shared[:1, :0],
+            shared=torch.zeros_like(variance)[None, None, :][:, :0],
+            head_shared=self.head_shared[:1, :0, :0],
             kind=self.kind[:1, :1] * 0,
         )
 

@@ -28,6 +28,8 @@ class Block(NamedTuple):
     of: Int[Tensor, "n"]
     """The Gaussian of each kind."""
     centre: Float[Tensor, "n i"]
+    length: Float[Tensor, "n"]
+    """Squared lengths of the centres."""
     along: Float[Tensor, "n a"]
     """Centres along the axes of their Gaussians."""
     by_shared: Float[Tensor, "n q"]
@@ -44,12 +46,13 @@ class Block(NamedTuple):
             along[members] = centre[members] @ axes[group].T
             by_shared[members] = centre[members] @ shared[group].T
         shared_along, gram = shared @ axes.mT, shared @ shared.mT
-        return cls(axes, variance, left, shared, shared_along, gram, of, centre, along, by_shared)
+        length = centre.square().sum(1)
+        return cls(axes, variance, left, shared, shared_along, gram, of, centre, length, along, by_shared)
 
     def chosen(self, kinds: Int[Tensor, "m"]) -> Block:
         """The block of some kinds, with their Gaussians."""
         groups, of = self.of[kinds].unique(return_inverse=True)
-        of_kinds = {name: getattr(self, name)[kinds] for name in ("centre", "along", "by_shared")}
+        of_kinds = {name: getattr(self, name)[kinds] for name in ("centre", "length", "along", "by_shared")}
         of_groups = {
             name: getattr(self, name)[groups]
             for name in ("axes", "variance", "left", "shared", "shared_along", "shared_gram")
@@ -74,14 +77,14 @@ def _evidence(block: Block, y: Tensor, signal: Tensor, noise: Tensor) -> _Eviden
     total = wide**2 * block.variance + noise[..., None] ** 2
     total_left = signal**2 * block.left + noise**2
     extra = 1 / total - 1 / total_left[..., None]
-    y_along = torch.einsum("bi,gai->bga", y, block.axes)
+    y_along = _along(y, block.axes)
     weighted = y_along * extra
     determinant = total.log().sum(2) + (block.axes.shape[2] - block.axes.shape[1]) * total_left.log()
     own = y.square().sum(1, keepdim=True) / total_left + (weighted * y_along).sum(2) + determinant
     extra_along = extra[:, of] * block.along
     cross = y @ block.centre.T / total_left[:, of] + (weighted[:, of] * block.along).sum(2)
-    between = block.centre.square().sum(1) / total_left[:, of] + (extra_along * block.along).sum(2)
-    by_y = torch.einsum("bi,gqi->bgq", y, block.shared) / total_left[..., None]
+    between = block.length / total_left[:, of] + (extra_along * block.along).sum(2)
+    by_y = _along(y, block.shared) / total_left[..., None]
     by_y += torch.einsum("bga,gqa->bgq", weighted, block.shared_along)
     by_centre = block.by_shared / total_left[:, of, None]
     by_centre += torch.einsum("bna,nqa->bnq", extra_along, block.shared_along[of])
@@ -100,8 +103,9 @@ def posterior(
     """Probability of each kind of the blocks given y, for log weights [b, n], and the shared part that it expects."""
     each_y = y.split([block.centre.shape[1] for block in blocks], dim=1)
     clothes, head = (_evidence(block, own, signal, noise) for block, own in zip(blocks, each_y, strict=True))
-    pairs, pair = torch.stack([block.of for block in blocks], dim=1).unique(dim=0, return_inverse=True)
-    gram = clothes.gram[:, pairs[:, 0]] + head.gram[:, pairs[:, 1]]
+    heads = head.gram.shape[1]
+    pairs, pair = (blocks[0].of * heads + blocks[1].of).unique(return_inverse=True)
+    gram = clothes.gram[:, pairs // heads] + head.gram[:, pairs % heads]
     factor = torch.linalg.cholesky(gram + torch.eye(gram.shape[-1]).to(gram))
     pull = clothes.pull + head.pull
     u = torch.cholesky_solve(pull[..., None], factor[:, pair])[..., 0]
@@ -137,8 +141,18 @@ def _mean_of_block(
     shares, shared = of_groups(share), of_groups(share[..., None] * u)
     remaining = 1 - signal * gain_left
     mean = (share * remaining[:, block.of]) @ block.centre
-    mean += torch.einsum("bgq,gqi->bi", remaining[..., None] * shared, block.shared)
+    mean += _summed(remaining[..., None] * shared, block.shared)
     mean += (shares * gain_left).sum(1, keepdim=True) * y
     expected = of_groups(share[..., None] * block.along) + torch.einsum("bgq,gqa->bga", shared, block.shared_along)
-    difference = shares[..., None] * torch.einsum("bi,gai->bga", y, block.axes) - wide * expected
-    return mean + torch.einsum("bga,gai->bi", gain * difference, block.axes)
+    difference = shares[..., None] * _along(y, block.axes) - wide * expected
+    return mean + _summed(gain * difference, block.axes)
+
+
+def _along(y: Float[Tensor, "b i"], directions: Float[Tensor, "g q i"]) -> Float[Tensor, "b g q"]:
+    """Inner products; einsum would copy the directions."""
+    return (y @ directions.flatten(0, 1).T).unflatten(1, directions.shape[:2])
+
+
+def _summed(weights: Float[Tensor, "b g q"], directions: Float[Tensor, "g q i"]) -> Float[Tensor, "b i"]:
+    """Weighted sums of the directions."""
+    return weights.flatten(1) @ directions.flatten(0, 1)

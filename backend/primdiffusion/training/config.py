@@ -45,12 +45,14 @@ class PriorConfig:
     ignored."""
     heads: tuple[str, ...] = ("sex", "hair", "hat")
     """Attributes that define the heads, each with its own covariance."""
+    hanging: tuple[str, ...] = ("long", "ponytail", "braid")
+    """Values of `heads` with hair that hangs over the clothes and covers a part of them."""
     features: tuple[tuple[str, ...], ...] = (("shoes",),)
     """Further attributes that shift the mean, each list independently."""
     axes: int = 96
     """Principal axes of a covariance."""
     shared: int = 4
-    """Directions of the skin, which clothes and heads share."""
+    """Directions of the skin, which clothes and heads share; as many of the hair of each style in `hanging`."""
     lean: float = 4.0
     """Shrinkage of the groups' covariances to those of all data: its weight as samples."""
     folds: int = 4

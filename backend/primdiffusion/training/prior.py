@@ -11,11 +11,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.components import PersonComponents
@@ -24,6 +26,7 @@ from primdiffusion.diffusion.gaussian import IMPOSSIBLE, PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.editing.regions import region_of
 from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.hanging_hair import HangingHair, find_hanging_hair, principal_directions
 from primdiffusion.training.latents import CHUNK, LatentSet
 
 RIDGE = 4.0
@@ -43,6 +46,7 @@ def fit_mixture(
     condition: Float[Tensor, "n x"],
     vocabulary: AttributeVocabulary,
     config: PriorConfig,
+    inside: PersonComponents,
 ) -> dict[str, Tensor]:
     """Kinds, as fields of `PersonPrior`, for all that can be put together of the people's attributes; a single one if
     they have none.
@@ -59,55 +63,89 @@ def fit_mixture(
     choices = [sorted(set(row)) for row in rows]
     effects, remainder = _effects(c, clothes, rows, choices)
     garments = [tuple(v for name, v in zip(groups, row, strict=True) if name != "sex") for row in rows[0]]
-    shared, remainder = _shared(remainder, clothes, rows[0], choices[0], garments, config)
-    axes = _covariances(remainder[:, :clothes], rows[0], choices[0], garments, config)
-    head_axes = _covariances(remainder[:, clothes:], rows[1], choices[1], rows[1], config)
-    all_kinds = [_kinds(group, keys, rows, choices) for group in choices[0]]
-    size = len(all_kinds), max(map(len, all_kinds))
+    skin, skin_of_head, remainder = _skin(remainder, clothes, rows[0], choices[0], garments, config)
+    style_of = [_hanging(head, heads, vocabulary, config) for head in choices[1]]
+    if all(style_of) or clothes == c.shape[1]:  # nobody shows the clothes below, or heads are not told from clothes
+        style_of = [None] * len(style_of)
+    styles = [style_of[choices[1].index(head)] for head in rows[1]]
+    bare = torch.tensor([style is None for style in styles])
+    of_group = [garments[rows[0].index(group)] for group in choices[0]]
+    covariances = _covariances(remainder[bare, :clothes], list(compress(rows[0], bare)), choices[0], of_group, config)
+    hair: dict[str | None, HangingHair] = {}
+    for style in sorted(set(filter(None, styles))):
+        own = torch.tensor([each == style for each in styles])
+        hair[style], remainder[own, clothes:] = find_hanging_hair(
+            remainder[bare, :clothes], remainder[own], inside, config.shared
+        )
+    directions = len(next(iter(hair.values())).of_head) if hair else 0
+    hair[None] = HangingHair(
+        torch.eye(clothes), torch.zeros(directions, clothes), torch.zeros(directions, c.shape[1] - clothes)
+    )
+    head_shared = torch.stack([torch.cat([skin_of_head, hair[style].of_head]) for style in style_of])
+    head_axes = _axes(_covariances(remainder[:, clothes:], rows[1], choices[1], choices[1], config), config)
+    below = [
+        (g, style, kinds)
+        for g, group in enumerate(choices[0])
+        for style in hair
+        if (kinds := [
+            each for each in _kinds(group, keys, rows, choices) if style_of[choices[1].index(each[1][1])] == style
+        ])
+    ]  # fmt: skip
+    axes = _axes([hair[style].through.T @ covariances[g] @ hair[style].through for g, style, _ in below], config)
+    shared = torch.stack([torch.cat([skin[g] @ hair[style].through, hair[style].of_clothes]) for g, style, _ in below])
+    size = len(below), max(len(kinds) for *_, kinds in below)
     log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
     centre, kind = torch.zeros(*size, c.shape[1]), torch.zeros(*size, condition.shape[1])
-    for g, kinds in enumerate(all_kinds):
+    mean = c.mean(0)
+    for g, (own, style, kinds) in enumerate(below):
+        of_clothes = effects[0][own] - mean
+        of_clothes[:clothes] = of_clothes[:clothes] @ hair[style].through
         for m, (log_share, chosen) in enumerate(kinds):
             log_weight[g, m] = log_share
-            centre[g, m] = sum(effects[k][choices[k].index(v)] for k, v in enumerate(chosen))
+            of_others = [effects[k][choices[k].index(v)] for k, v in enumerate(chosen) if k]
+            centre[g, m] = torch.stack([mean, of_clothes, *of_others]).sum(0)
             head[g, m] = choices[1].index(chosen[1])
             kind[g, m] = _condition(chosen, keys, vocabulary)
     log_weight = log_weight - log_weight.flatten().logsumexp(0)
     return {
         "log_weight": log_weight, "centre": centre, "axes": axes[0], "variance": axes[1], "left": axes[2],
         "head": head, "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
-        "shared": shared, "kind": kind,
+        "shared": shared, "head_shared": head_shared, "kind": kind,
     }  # fmt: skip
 
 
-def _shared(
+def _skin(
     c: Float[Tensor, "n r"],
     clothes: int,
     group: Sequence[Values],
     groups: Sequence[Values],
     garments: Sequence[Values],
     config: PriorConfig,
-) -> tuple[Float[Tensor, "g q r"], Float[Tensor, "n r"]]:
-    """Leading principal directions of hands, with what goes with them elsewhere, and what they leave.
+) -> tuple[Float[Tensor, "g q o"], Float[Tensor, "q s"], Float[Tensor, "n r"]]:
+    """Directions of the skin in the clothes of each group and in the head, and what they leave.
 
-    Hands are bare in every outfit, so these are the directions of skin. Bare legs have its tone, trousers do not: so
-    clothes have a regression for each outfit, as far as they show it.
+    Hands are bare in every outfit, so their leading principal directions are those of skin. Bare legs have its tone,
+    trousers do not: so clothes have a regression for each outfit, as far as they show it.
     """
     hands = c[:, clothes : (c.shape[1] + clothes) // 2]
-    value, vector = torch.linalg.eigh((hands.T @ hands).double() / len(hands))
-    value, vector = value.flip(0)[: config.shared].clamp_min(1e-12).float(), vector.flip(1)[:, : config.shared].float()
-    scores = hands @ vector / value.sqrt()
-    shared = (scores.T @ c / len(c)).repeat(len(groups), 1, 1)
-    remainder = c - scores @ shared[0]
+    deviation, vector = principal_directions(hands, config.shared)
+    scores = hands @ vector / deviation
+    on_head = scores.T @ c[:, clothes:] / len(c)
+    shared, remainder = c.new_zeros(len(groups), scores.shape[1], clothes), c.clone()
+    remainder[:, clothes:] -= scores @ on_head
     for g, values in enumerate(groups):
         of_group = torch.tensor([v == values for v in group])
         garment = garments[group.index(values)]
         alike = torch.tensor([v == garment for v in garments])
-        shared[g, :, :clothes], unknown = _shown(c[alike, :clothes], scores[alike], scores.shape[1])
-        remainder[of_group, :clothes] = c[of_group, :clothes] - (1 - unknown) * (
-            scores[of_group] @ shared[g, :, :clothes]
-        )
-    return shared, remainder
+        shared[g], unknown = _shown(c[alike, :clothes], scores[alike], scores.shape[1])
+        remainder[of_group, :clothes] -= (1 - unknown) * (scores[of_group] @ shared[g])
+    return shared, on_head, remainder
+
+
+def _hanging(head: Values, names: Sequence[str], vocabulary: AttributeVocabulary, config: PriorConfig) -> str | None:
+    """The value of a head that says that its hair hangs over the clothes; None if it does not."""
+    words = [vocabulary.categories[name][v] for name, v in zip(names, head, strict=True) if v >= 0]
+    return next((word for word in words if word in config.hanging), None)
 
 
 def _values(condition: Float[Tensor, "n a"], vocabulary: AttributeVocabulary) -> dict[str, list[int]]:
@@ -128,7 +166,7 @@ def _effects(
     long hair hangs over a collar, but the shirts of the few people who have it do not colour everybody's.
     """
     designs = [
-        torch.nn.functional.one_hot(torch.tensor([options.index(v) for v in row]), len(options)).float()
+        functional.one_hot(torch.tensor([options.index(v) for v in row]), len(options)).float()
         for row, options in zip(rows, choices, strict=True)
     ]
     mean = c.mean(0)
@@ -179,22 +217,30 @@ def _covariances(
     groups: Sequence[Values],
     garments: Sequence[Values],
     config: PriorConfig,
-) -> tuple[Float[Tensor, "g a i"], Float[Tensor, "g a"], Float[Tensor, "g"]]:
-    """Principal axes and variances of each group's people.
+) -> list[Float[Tensor, "i i"]]:
+    """Covariance of each group's people.
 
-    Those of the same `garments` in other groups count by half, and `config.lean` of all groups alike in the last value.
-    `config.axes` axes are kept; the mean variance of the others is that of all directions left.
+    Those of groups in the same `garments` count by half, and `config.lean` of all groups alike in the last value.
     """
-    worn = dict(zip(group, garments, strict=True))
     members = [torch.tensor([v == values for v in group]) for values in groups]
     counts = torch.tensor([float(one.sum()) for one in members])
     scatter = torch.stack([c[one].T @ c[one] for one in members])
-    axes, variances, left = [], [], []
-    for own in groups:
+    covariances = []
+    for g, own in enumerate(groups):
         alike = torch.tensor([float(values[-1:] == own[-1:]) for values in groups])
-        share = torch.tensor([1.0 if v == own else SAME_GARMENTS * (worn[v] == worn[own]) for v in groups])
-        share += config.lean * alike / (alike @ counts)
-        covariance = torch.einsum("h,hij->ij", share / (share @ counts), scatter)
+        share = torch.tensor([SAME_GARMENTS * (worn == garments[g]) for worn in garments])
+        share[g] = 1.0
+        share += config.lean * alike / (alike @ counts).clamp_min(1)
+        covariances.append(torch.einsum("h,hij->ij", share / (share @ counts).clamp_min(1e-6), scatter))
+    return covariances
+
+
+def _axes(
+    covariances: Sequence[Float[Tensor, "i i"]], config: PriorConfig
+) -> tuple[Float[Tensor, "g a i"], Float[Tensor, "g a"], Float[Tensor, "g"]]:
+    """`config.axes` principal axes and variances of each covariance, and the mean variance of all directions left."""
+    axes, variances, left = [], [], []
+    for covariance in covariances:
         value, vector = torch.linalg.eigh(covariance.double())
         value = value.flip(0).clamp_min(max(float(value.max()) * 1e-7, 1e-12) if len(value) else 0.0)
         kept = min(config.axes, len(value))
@@ -273,7 +319,7 @@ def fit_prior(
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
     clothes = max(count, len(signs) - 2 * count)  # the others are hands and head; a single part is all
-    kinds = fit_mixture(c, clothes, people.condition, vocabulary, config)
+    kinds = fit_mixture(c, clothes, people.condition, vocabulary, config, inside)
     return PersonPrior(**vars(inside), rest_variance=rest.clamp_min(1e-6), **kinds)
 
 
@@ -369,8 +415,8 @@ def _held_out_ratios(grams: list[Tensor], geometry: Int[Tensor, "n"], config: Pr
 
 def _smooth(values: Float[Tensor, "r"], width: int = 9) -> Float[Tensor, "r"]:
     """Running mean in log space: the ratio of a single component is noisy, its trend is not."""
-    padded = torch.nn.functional.pad(values.log()[None, None], (width // 2, width // 2), mode="replicate")
-    return torch.nn.functional.avg_pool1d(padded, width, stride=1)[0, 0].exp()
+    padded = functional.pad(values.log()[None, None], (width // 2, width // 2), mode="replicate")
+    return functional.avg_pool1d(padded, width, stride=1)[0, 0].exp()
 
 
 def fit_shapes(people: LatentSet, prior: PersonPrior, ridge: float = 30.0) -> ShapePrior:

@@ -123,7 +123,7 @@ def test_centres_that_are_sums_of_few_effects_are_stored_as_factors(path):
 def test_a_prior_of_before_parts_is_one_of_the_whole_body(path):
     model = small_model()
     save_checkpoint(path, model, "linear")
-    later = ("part", "left", "head", "head_axes", "head_variance", "head_left", "shared")
+    later = ("part", "left", "head", "head_axes", "head_variance", "head_left", "shared", "head_shared")
 
     def before(tensors):
         kept = {key: value for key, value in tensors.items() if key.removeprefix("denoiser.prior_") not in later}

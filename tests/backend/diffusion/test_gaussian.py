@@ -38,7 +38,8 @@ def coefficient_covariance(prior, group, kind):
         spread(prior.axes[group], prior.variance[group], prior.left[group]),
         spread(prior.head_axes[head], prior.head_variance[head], prior.head_left[head]),
     )
-    return own + prior.shared[group].T @ prior.shared[group]
+    shared = torch.cat([prior.shared[group], prior.head_shared[head]], dim=1)
+    return own + shared.T @ shared
 
 
 def covariance_of(prior, group, kind):

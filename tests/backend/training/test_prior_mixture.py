@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
@@ -19,6 +20,8 @@ WORDS = AttributeVocabulary(
     {"height": (1.7, 0.1)},
 )
 CONFIG = PriorConfig(lean=0.4, axes=4, shared=1)
+ONE_EACH = PersonComponents(torch.zeros(1, 1, 7), torch.ones(1, 7, 1), torch.arange(7), torch.ones(7))
+"""A component for each of seven cells."""
 DRESS = {"sex": "female", "outfit": "dress"}
 PEOPLE = [
     *[{**DRESS, "hair": "bob", "shoes": "boots"}] * 300,
@@ -49,7 +52,7 @@ def components(spread=0.1):
 @pytest.fixture(scope="module")
 def mixture():
     condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in PEOPLE])
-    return SimpleNamespace(**fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG))
+    return SimpleNamespace(**fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG, ONE_EACH))
 
 
 def part(mixture, **asked):
@@ -63,9 +66,9 @@ def part(mixture, **asked):
 def test_kinds_are_all_that_can_be_put_together_and_weights_sum_to_one(mixture):
     real = mixture.log_weight > IMPOSSIBLE / 2
     assert mixture.log_weight.exp().sum().item() == pytest.approx(1, abs=1e-5)
-    # two groups of women with two hair styles, one of men with one; two pairs of shoes each
+    # two outfits of women with two hair styles, of which one hangs over them, one of men; two pairs of shoes each
     assert real.sum() == 2 * 2 * 2 + 1 * 2
-    assert mixture.log_weight.shape == (3, 4)
+    assert mixture.log_weight.shape == (5, 2)
     assert not mixture.kind[..., WORDS.blocks()["hair"]][~real].any()
 
 
@@ -106,14 +109,15 @@ def test_heads_keep_the_variance_of_their_hair(mixture):
     spread = []
     for hair in ("long", "bob"):
         head = mixture.head[part(mixture, **DRESS, hair=hair, shoes="boots")]
-        spread.append(variances(mixture.head_axes[head], mixture.head_variance[head], mixture.head_left[head])[1])
+        own = variances(mixture.head_axes[head], mixture.head_variance[head], mixture.head_left[head])
+        spread.append((own + mixture.head_shared[head, 1:].square().sum(0))[1])
     assert spread[0].item() == pytest.approx(1.0, rel=0.3)
     assert spread[1] < 0.2
 
 
 def fitted(people, c, config=CONFIG):
     condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in people])
-    return SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, config))
+    return SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, config, ONE_EACH))
 
 
 def test_what_happens_to_go_with_hair_and_skin_does_not_colour_clothes():
@@ -127,15 +131,15 @@ def test_what_happens_to_go_with_hair_and_skin_does_not_colour_clothes():
 
 
 def test_the_variance_is_that_of_the_people_however_little_of_it_is_explained():
-    few = [{**DRESS, "hair": hair, "shoes": shoes} for hair in ("bob", "long") for shoes in ("boots", "pumps")] * 10
+    few = [{**DRESS, "hair": hair, "shoes": shoes} for hair in ("bob", "crew") for shoes in ("boots", "pumps")] * 10
     for seed in range(5):
         c = torch.randn(len(few), CLOTHES + 2, generator=torch.Generator().manual_seed(seed))
         mixture = fitted(few, c)
         weight = mixture.log_weight[0].exp()
         mean = weight @ mixture.centre[0]
-        spread = weight @ (mixture.centre[0] - mean).square() + mixture.shared[0].square().sum(0)
-        spread[:CLOTHES] += variances(mixture.axes[0], mixture.variance[0], mixture.left[0])
-        assert spread[:CLOTHES].sum() == pytest.approx(c[:, :CLOTHES].square().mean(0).sum().item(), rel=0.1)
+        spread = weight @ (mixture.centre[0] - mean).square()[:, :CLOTHES] + mixture.shared[0].square().sum(0)
+        spread += variances(mixture.axes[0], mixture.variance[0], mixture.left[0])
+        assert spread.sum() == pytest.approx(c[:, :CLOTHES].square().mean(0).sum().item(), rel=0.1)
 
 
 def test_the_other_sex_in_the_same_garments_counts_by_half():
@@ -153,15 +157,39 @@ def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
         mixture.shared[part(mixture, sex="female", outfit=outfit, hair="bob", shoes="boots")[0], 0]
         for outfit in ("dress", "jeans")
     )
-    sign = dress[5].sign()
-    assert torch.allclose(sign * dress[4:], torch.tensor([2.0, 1.0, 3.0]), rtol=0.1)
+    heads = mixture.head_shared[:, 0]
+    sign = heads[0, 0].sign()
+    assert torch.allclose(sign * heads, torch.tensor([1.0, 3.0]).expand(3, -1), rtol=0.1)
+    assert sign * dress[4] == pytest.approx(2.0, rel=0.1)
     assert jeans[4].abs() < 0.2
-    assert torch.equal(jeans[5:], dress[5:])
-    assert mixture.axes.shape == (3, 4, CLOTHES)
+    assert mixture.axes.shape == (5, 4, CLOTHES)
     assert mixture.head_axes.shape == (3, 2, 2)
 
 
+def test_hair_covers_clothes_in_its_own_colour_and_leaves_other_people_none():
+    c, generator = components(), torch.Generator().manual_seed(2)
+    for row, person in zip(c, PEOPLE, strict=True):
+        of_shirt, of_hair = torch.randn(2, generator=generator)
+        row[2] += 2 * of_shirt
+        if person["hair"] == "long":
+            row[1] = 5 + of_hair
+            row[6] += 5 * of_hair
+        else:
+            row[1] += 2 * of_shirt
+    mixture = fitted(PEOPLE, c, PriorConfig(lean=0, axes=4, shared=1))
+    bob, long = (part(mixture, **DRESS, hair=hair, shoes="boots") for hair in ("bob", "long"))
+    on_clothes, on_head = mixture.shared[long[0], 1], mixture.head_shared[mixture.head[long], 1]
+    assert (on_clothes[1] / on_head[1]).item() == pytest.approx(5 / 26, rel=0.3)
+    assert not mixture.shared[bob[0], 1].any()
+    assert not mixture.head_shared[mixture.head[bob], 1].any()
+    of_bob, of_long = (variances(mixture.axes[g], mixture.variance[g], mixture.left[g]) for g, _ in (bob, long))
+    assert torch.allclose(of_bob[1:3], torch.tensor([4.0, 4.0]), rtol=0.3)
+    assert of_long[1] < 0.3
+    assert of_long[2].item() == pytest.approx(4, rel=0.4)
+
+
 def test_people_of_whom_nothing_is_known_are_one_gaussian():
-    mixture = SimpleNamespace(**fit_mixture(components(), CLOTHES, torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG))
+    unknown = torch.zeros(len(PEOPLE), 0)
+    mixture = SimpleNamespace(**fit_mixture(components(), CLOTHES, unknown, NOTHING, CONFIG, ONE_EACH))
     assert mixture.log_weight.shape == (1, 1)
     assert torch.allclose(mixture.centre[0, 0], components().mean(0), atol=0.1)

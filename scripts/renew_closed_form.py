@@ -1,0 +1,111 @@
+"""Give a checkpoint of the default preset a closed form fitted to other people; its codec and local network stay.
+
+    python -m scripts.renew_closed_form --people people --more earlier_people --out start.safetensors
+    primdiffusion train --start-from start.safetensors --data people --run runs/next
+
+The included checkpoint was made so. Plain colourings of `--more` count for the closed form alone. The network over
+person components goes: its components are others now. The local network keeps its weights for what has not changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import torch
+from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
+from primdiffusion.diffusion.codec import CellCodec
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.people.stored_people import PersonFolder
+from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.latents import LatentSet, encode_people, vocabulary_of
+from primdiffusion.training.prior import fit_prior, fit_shapes
+from torch import Tensor
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--base", type=Path, help="checkpoint to renew; default: the included one")
+    parser.add_argument("--people", type=Path, required=True, help="folder of `primdiffusion payloads`")
+    parser.add_argument("--more", type=Path, help="further people, of an earlier wardrobe")
+    parser.add_argument("--without", nargs="*", default=["suit"], help="outfits of --more that are left out")
+    parser.add_argument("--channels", type=int, default=96, help="leading latent channels of person components")
+    parser.add_argument("--axes", type=int, default=64, help="principal axes of a covariance")
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    base = load_checkpoint(arguments.base)
+    assert isinstance(base.codec, CellCodec)
+    codec, people = base.codec.codec, PersonFolder(arguments.people)
+    vocabulary = vocabulary_of(known for index in range(len(people.names)) for known in people.known(index))
+    latents = encode_people(people, range(len(people.names)), codec, vocabulary)
+    if arguments.more is not None:
+        more = PersonFolder(arguments.more)
+        others = encode_people(more, range(len(more.names)), codec, vocabulary)
+        used = [
+            known.get("pattern") == "plain" and known.get("outfit") not in arguments.without
+            for index in range(len(more.names))
+            for known in more.known(index)
+        ]
+        latents = joined(latents, others, torch.tensor(used))
+    prior = fit_prior(latents, codec, vocabulary, PriorConfig(channels=arguments.channels, axes=arguments.axes))
+    shapes = fit_shapes(latents, prior)
+    assert isinstance(base.denoiser, PersonDenoiser)
+    denoiser = with_prior(base.denoiser, prior)
+    card = {**base.card, "geometries": len(latents.betas), "people": len(latents)}
+    model = DiffusionModel(
+        denoiser, base.schedule, base.codec, shapes, base.full_density, card, vocabulary, base.chain
+    )  # fmt: skip
+    save_checkpoint(arguments.out, model, str(base.card["schedule"]))
+    print(arguments.out, len(latents.betas), "geometries,", len(latents), "colourings")
+
+
+def joined(latents: LatentSet, more: LatentSet, used: Tensor) -> LatentSet:
+    """Add the samples of `more` that are used; detail is learned from the first set alone."""
+    geometry, kept = more.geometry[used].unique(return_inverse=True)
+    return LatentSet(
+        torch.cat([latents.latents, more.latents[used]]),
+        torch.cat([latents.geometry, kept + len(latents.betas)]),
+        torch.cat([latents.betas, more.betas[geometry]]),
+        torch.cat([latents.condition, more.condition[used]]),
+        latents.detailed,
+    )
+
+
+def with_prior(base: PersonDenoiser, prior: PersonPrior) -> PersonDenoiser:
+    """A denoiser of another prior with the local network of `base`, which forgets attributes and person components."""
+    denoiser = PersonDenoiser(dataclasses.replace(base.config, person=None), prior, base.schedule)
+    assert base.local is not None
+    assert denoiser.local is not None
+    weights = denoiser.local.state_dict()
+    for name, weight in base.local.state_dict().items():
+        if name in ("person.weight", "asked.weight"):
+            weights[name] = torch.zeros_like(weights[name])
+        elif name == "inner.weight":
+            weights[name] = _inner_weight(base, denoiser)
+        else:
+            weights[name] = weight
+    denoiser.local.load_state_dict(weights)
+    return denoiser.eval().requires_grad_(False)
+
+
+def _inner_weight(base: PersonDenoiser, denoiser: PersonDenoiser) -> Tensor:
+    """Weights of the first convolution: those of the picture of person components, which it sees in units of its
+    standard deviation, are rescaled, and those of channels that were not drawn are 0."""
+    assert base.local is not None
+    weight, channels = base.local.inner.weight, base.prior.mean.shape[0]
+    rest, picture, position = weight.split(
+        [channels, base.local.picture_channels, weight.shape[1] - channels - base.local.picture_channels], dim=1
+    )
+    drawn = denoiser.prior.basis.shape[2]
+    both = min(drawn, picture.shape[1])
+    ours = weight.new_zeros(len(weight), drawn, *weight.shape[2:])
+    scale = denoiser.picture_std[:both] / base.picture_std[:both]
+    ours[:, :both] = picture[:, :both] * scale[None, :, None, None]
+    return torch.cat([rest, ours, position], dim=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""A new closed form for a checkpoint: what its local network keeps."""
+
+import dataclasses
+
+import torch
+from diffusion_people import small_model
+from primdiffusion.training.latents import LatentSet
+from scripts.renew_closed_form import joined, with_prior
+
+
+def test_the_local_network_keeps_all_but_attributes_and_person_components():
+    base = small_model().denoiser
+    same = with_prior(base, base.prior)
+    assert same.person is None
+    for name, weight in same.local.state_dict().items():
+        wanted = base.local.state_dict()[name]
+        assert torch.equal(weight, torch.zeros_like(wanted) if name in ("person.weight", "asked.weight") else wanted)
+
+
+def test_weights_of_the_picture_of_components_follow_its_spread():
+    base = small_model().denoiser
+    wider = dataclasses.replace(base.prior, variance=4 * base.prior.variance, left=4 * base.prior.left,
+                                head_variance=4 * base.prior.head_variance, head_left=4 * base.prior.head_left,
+                                centre=2 * base.prior.centre, shared=2 * base.prior.shared,
+                                head_shared=2 * base.prior.head_shared)  # fmt: skip
+    same, twice = (with_prior(base, prior).local.inner.weight for prior in (base.prior, wider))
+    channels, drawn = base.prior.mean.shape[0], base.prior.basis.shape[2]
+    assert torch.allclose(twice[:, channels : channels + drawn], 2 * same[:, channels : channels + drawn], rtol=1e-4)
+    assert torch.equal(twice[:, :channels], same[:, :channels])
+
+
+def test_further_people_count_without_their_detail():
+    def people(geometry):
+        count = len(geometry)
+        return LatentSet(torch.zeros(count, 1, 1, 1), torch.tensor(geometry), torch.arange(10.0).repeat(3, 1),
+                         torch.zeros(count, 1), torch.tensor(count))  # fmt: skip
+
+    both = joined(people([0, 0, 1, 2]), people([0, 1, 1, 2]), torch.tensor([False, True, True, True]))
+    assert both.geometry.tolist() == [0, 0, 1, 2, 3, 3, 4]
+    assert len(both.betas) == 5
+    assert both.detailed == 4
