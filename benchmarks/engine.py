@@ -120,7 +120,7 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
         with (
             timed(engine, "render_layer", whole),
             timed(engine, "scene_content", gather),
-            timed(engine, "solids_file", gather),
+            timed(engine, "scene_solids", gather),
             timed(engine, "_fill", fill),
         ):
             for frame in range(WARM_UP + FRAMES):

@@ -39,7 +39,7 @@ from blender_primdiffusion.scene import merged as merging
 from blender_primdiffusion.scene.armature import keyframe_poses, model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.representation import set_representation, show_in_viewport
-from blender_primdiffusion.scene.volume_nodes import density_gain, files_of, write_volumes
+from blender_primdiffusion.scene.volume_nodes import GAIN_NODE, MATERIAL_NAME, files_of, write_volumes
 
 SEED, STEPS, SIZE, GREY = 7, 30, 512, 0.48
 FRAMES = 10
@@ -184,7 +184,7 @@ def main() -> None:
     setup_cycles_preview(bpy.context.scene, size=SIZE, samples=1, yaw=0.5, world=GREY)
     pictures = {}
     for name, gain in (("usual", DENSITY_GAIN), ("fitted", gains["gain_gain"])):
-        density_gain().default_value = gain
+        bpy.data.materials[MATERIAL_NAME].node_tree.nodes[GAIN_NODE].outputs[0].default_value = gain
         set_representation(person, "MERGED")
         pictures[name], figures["seconds_cycles_merged"] = rendered(folder / f"merged_{name}.png")
     bpy.context.scene.render.engine = "PRIMDIFFUSION"

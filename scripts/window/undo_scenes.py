@@ -131,8 +131,8 @@ def undo_while_generating(module: str, python: str) -> Steps:
         if number % FRESH_EVERY == 0:
             bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
             yield 1.0
-            settings = bpy.context.scene.primdiffusion_variations
-            settings.count, settings.quality = "4", "DRAFT"
+            bpy.context.scene.primdiffusion_variations.count = "4"
+            bpy.context.scene.primdiffusion.quality = "DRAFT"
         select(armatures()[0])
         this, name = Round(module, number), armatures()[0].name
         yield {"point": _middle_of_the_view()}

@@ -1,4 +1,4 @@
-"""`primdiffusion payloads encode`: captures in, training payloads out; and `pack`, `verify` on the command line."""
+"""`primdiffusion payloads encode`: captures in, training payloads out."""
 
 import json
 

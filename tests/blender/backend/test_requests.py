@@ -2,9 +2,11 @@
 
 import pytest
 
+from jobs_driven import Layout
+
 from blender_primdiffusion.backend.requests import error_text, sentence
 from blender_primdiffusion.console import Report, separate_stdout
-from blender_primdiffusion.ui import drawing
+from blender_primdiffusion.ui.drawing import draw_lines
 
 pytestmark = pytest.mark.any_blender
 
@@ -16,7 +18,10 @@ def test_no_terminal_escape_leaves_in_a_sentence_a_line_or_a_report(capfd):
     for error in (FileNotFoundError(2, "No such file", ESCAPE), ValueError(f"{ESCAPE}\n"), ESCAPE):
         assert sentence(error).isprintable()
         assert "owned" in error_text(error)
-    assert all(line.isprintable() for line in drawing._wrapped(f"It is {ESCAPE}", 40))
+    layout = Layout()
+    draw_lines(layout, f"It is {ESCAPE}", "ERROR")
+    assert all(line.isprintable() for line in layout.of("text"))
+    assert "owned" in "".join(layout.of("text"))
     with separate_stdout() as say:
         say(f"{ESCAPE}: damaged")
     said = capfd.readouterr().out
