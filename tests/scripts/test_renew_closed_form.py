@@ -5,6 +5,7 @@ import dataclasses
 import torch
 from diffusion_people import small_model
 from primdiffusion.training.latents import LatentSet
+
 from scripts.renew_closed_form import joined, with_prior
 
 

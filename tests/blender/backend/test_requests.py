@@ -1,7 +1,6 @@
 """Sentences on errors."""
 
 import pytest
-
 from jobs_driven import Layout
 
 from blender_primdiffusion.backend.requests import error_text, sentence
