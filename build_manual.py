@@ -1,6 +1,6 @@
 """Convert the manual (docs/manual/*.md) to HTML pages that work without a network.
 
-`build_addon.py` adds them to the zip. The panels' question marks and F1 open them.
+`build_addon.py` adds them to the zip. The panels' question marks open them.
 """
 
 from __future__ import annotations
