@@ -49,10 +49,9 @@ def factory_settings():
 @pytest.fixture
 def empty_scene(factory_settings):
     """A context with an empty, unsaved file."""
-    from human_files import forget_session_files
-
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    forget_session_files()
+    # Blender remembers what it read of volumes, and which were missing: only in another folder are they new to it
+    bpy.context.preferences.filepaths.temporary_directory = ""
     bpy.context.preferences.system.memory_cache_limit = GRIDS_KEPT_MB
     return bpy.context
 

@@ -42,11 +42,7 @@ OF_SCANS = {"primdiffusion_part"}
 """An attribute of meshes that captures make and render at once."""
 OF_FILES = ("capture/scan_files.py", "primdiffusion")
 """A key in a file that captures read."""
-OPERATORS_OWN = {
-    "scene/blend_values.py", "ui/export_panel.py",
-    "ui/motion_panel.py", "ui/picture_panel.py",
-    "ui/setup.py",
-}  # fmt: skip
+OPERATORS_OWN = {"scene/blend_values.py", "ui/export_panel.py", "ui/motion_panel.py", "ui/picture_panel.py"}
 """Modules that resolve paths: besides the reader, those whose operators are given one by the user or a script."""
 PERSON = "primdiffusion_person"
 """A custom property."""
