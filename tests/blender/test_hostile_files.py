@@ -14,7 +14,6 @@ import synthetic_shape
 from exporting import write_person
 from scene_state import state
 
-from blender_primdiffusion.jobs.follow import Session
 from blender_primdiffusion.scene.build import build_human
 
 pytestmark = pytest.mark.any_blender
@@ -28,8 +27,6 @@ READS = {
 """Operators that read a file: the property with its path, and endings."""
 WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human"))]
 """Operators that write the file of their `filepath`."""
-FOLDERS = {"set_up_backend"}
-"""Operators on the folder of their `directory`."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
 
@@ -129,8 +126,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("addon")
 def test_every_operator_with_a_path_gets_hostile_files():
     expected = {name.partition(" ")[0]: {shown} for name, (shown, _) in READS.items()}
-    expected |= {name: {"filepath"} for name, _ in WRITES} | {name: {"directory"} for name in FOLDERS}
-    assert with_paths() == expected
+    assert with_paths() == expected | {name: {"filepath"} for name, _ in WRITES}
 
 
 @pytest.mark.parametrize("name", READS)
@@ -155,13 +151,4 @@ def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name, end
     faults = [fault(name, anna, filepath=str(anna / place) if place else "") for place in places]
     assert not list(filter(None, faults)), "\n".join(filter(None, faults))
     assert sorted(anna.rglob("*")) == before
-    assert (anna / "file").read_bytes() == b"a user's file"
-
-
-@pytest.mark.parametrize("name", sorted(FOLDERS))
-def test_a_folder_that_is_none_is_named_in_one_sentence(anna, name, monkeypatch):
-    monkeypatch.setattr(Session, "follow", lambda *_: {"FINISHED"})
-    (anna / "file").write_bytes(b"a user's file")
-    faults = [fault(name, anna, directory=str(anna / place)) for place in ("file", "n" * 300, "nowhere")]
-    assert not list(filter(None, faults)), "\n".join(filter(None, faults))
     assert (anna / "file").read_bytes() == b"a user's file"
