@@ -1,5 +1,6 @@
 """Small people and captures for tests: boxes that follow two joints, drawn from few sides."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -70,11 +71,11 @@ def body_mesh(texture=((WHITE,),)) -> TexturedMesh:
     ))  # fmt: skip
 
 
-def save_person(path: Path, mesh: TexturedMesh | None = None) -> Path:
+def save_person(path: Path, mesh: TexturedMesh | None = None, betas: Sequence[float] = (0.0,) * 10) -> Path:
     """A person's .glb."""
     body = default_body()
-    skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), body.shape(torch.zeros(1)).joints.double().numpy())
-    extras = {"primdiffusion": {"betas": [0.0] * 10, "body": "default", "seed": 0}}
+    skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), body.shape(torch.tensor(betas)).joints.double().numpy())
+    extras = {"primdiffusion": {"betas": list(betas), "body": "default", "seed": 0}}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(glb(mesh or box_person(), skeleton, extras))
     return path

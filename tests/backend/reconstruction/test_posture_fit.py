@@ -237,7 +237,7 @@ def test_pose_files_of_others_give_a_pose_alone(tmp_path):
 @pytest.mark.parametrize(
     ("change", "word"),
     [({"betas": [9.0] * 10}, "betas"), ({"betas": [0.0]}, "betas"), ({"betas": "x"}, "betas"),
-     ({"pose": [[0.0] * 60]}, "pose"), ({"cameras": {}}, "cameras"), ({"cameras": {"camera0000": {}}}, "cameras"),
+     ({"pose": [[0.0] * 60]}, "pose"), ({"cameras": {}}, "cameras"), ({"cameras": {"camera0000": {}}}, "camera0000"),
      ({"cameras": {"camera0000": {"K": np.eye(3).tolist(), "R": (-np.eye(3)).tolist(), "T": [0] * 3}}}, "camera0000")],
 )  # fmt: skip
 def test_damaged_postures_are_refused(tmp_path, change, word):

@@ -223,7 +223,7 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
     ("change", "message"),
     [
         ("truncated", "truncated"),
-        ("no smpl", "SMPL_NEUTRAL.pkl: no such file"),
+        ("no smpl", "SMPL_NEUTRAL.pkl; give the path of an SMPL .pkl or .npz file"),
         ("another smpl", "SMPL_NEUTRAL.pkl"),
         ("another uv", "smpl_uv.obj"),
         ("no uv", "smpl_uv.obj: no such file"),

@@ -1,6 +1,7 @@
 """A run of stage 1: what it leaves, when it stops, and what it says of bad input."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
+from primdiffusion.files.folder_lock import LOCK
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training.fit import MODEL, EncoderTask, fit, run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
@@ -154,7 +156,7 @@ def test_captures_without_people_are_rejected(tmp_path):
     (tmp_path / "captures").mkdir()
     with refused(FileNotFoundError, "finished"):
         fit(settings(tmp_path / "captures", tmp_path / "run"))
-    assert not (tmp_path / "run").exists()
+    assert os.listdir(tmp_path / "run") == [LOCK]
 
 
 def test_a_person_with_one_view_trains_on_it_again_and_again(own, tmp_path):
@@ -182,7 +184,7 @@ def test_a_human_on_another_body_is_named_before_training_begins(own, tmp_path):
     np.savez(plain, **changed)
     with refused(ValueError, "person_000001", "16 betas"):
         fit(settings(own, tmp_path / "run"))
-    assert not (tmp_path / "run").exists()
+    assert os.listdir(tmp_path / "run") == [LOCK]
     with refused(ValueError, "person_000001", "16 betas"):
         fit(settings(own, tmp_path / "run", held=own))
 

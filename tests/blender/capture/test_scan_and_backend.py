@@ -11,7 +11,8 @@ import torch
 from blender_primdiffusion.formats.camera_rig import Rig, bounding_sphere
 from capture_child import small
 from capture_person import two_poses
-from loaded_scans import BETAS, BODY, load, own_person
+from capture_scenes import body_mesh, save_person
+from loaded_scans import BETAS, BODY, load
 from mathutils import Vector
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.coco import FACE, keypoints_of
@@ -32,7 +33,7 @@ pytestmark = pytest.mark.any_blender
 
 
 def test_both_programs_put_cameras_and_joints_in_the_same_places(tmp_path, empty_scene):
-    path = own_person(tmp_path / "anna.glb")
+    path = save_person(tmp_path / "anna.glb", body_mesh(), BETAS.tolist())
     poses = built_in_poses(3)
     theirs = set_up_capture(
         read_person(path),
