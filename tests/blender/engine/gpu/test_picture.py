@@ -86,10 +86,3 @@ def test_parallel_views_have_solids_at_the_same_place(marcher, backend, scene):
     view = view_from_matrices(np.diag([1.2, 0.8, -0.001, 1.0]), to_view, (-50.0, 50.0), (80, 120), subject)
     error = np.abs(composed(marcher, scene, view, None) - child(backend, scene, view, None)).max(-1)
     assert np.quantile(error, 0.9) <= STEP_OF_8_BIT
-
-
-def test_a_part_of_a_view_is_that_part_of_the_picture(marcher, scene):
-    view = pinhole(scene[3], (0.6, 0.3, 4.0), size=(80, 120))
-    whole = composed(marcher, scene, view, None)
-    part = composed(marcher, scene, view.part((16, 24, 40, 56)), None)
-    assert np.abs(part - whole[120 - 24 - 56 : 120 - 24, 16:56]).max() <= STEP_OF_8_BIT
