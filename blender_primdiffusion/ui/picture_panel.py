@@ -129,4 +129,20 @@ class PRIMDIFFUSION_PT_human_from_picture(BackendPanel, bpy.types.Panel):
         )
 
 
+class PRIMDIFFUSION_FH_picture(bpy.types.FileHandler):
+    """Pictures, while the panel's tab is open: otherwise Blender places a dropped picture as it always does."""
+
+    bl_idname = "PRIMDIFFUSION_FH_picture"
+    bl_label = "Human from Picture"
+    bl_import_operator = "primdiffusion.choose_picture"
+    bl_file_extensions = ".png;.jpg;.jpeg"
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        if context.area is None or context.area.type != "VIEW_3D" or not context.space_data.show_region_ui:
+            return False
+        tabs = (region.active_panel_category for region in context.area.regions if region.type == "UI")
+        return PRIMDIFFUSION_PT_human_from_picture.bl_category in tabs
+
+
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_picture", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_picture)),)

@@ -1,6 +1,7 @@
 """Human from Picture as the user meets it, with the real client and a child that moves an arm and the pelvis."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -19,7 +20,7 @@ from blender_primdiffusion.motion.poses import take_world_posture, world_posture
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import betas_of
-from blender_primdiffusion.ui.picture_panel import PRIMDIFFUSION_PT_human_from_picture
+from blender_primdiffusion.ui.picture_panel import PRIMDIFFUSION_OT_choose_picture, PRIMDIFFUSION_PT_human_from_picture
 
 pytestmark = pytest.mark.any_blender
 WIDTH, HEIGHT = 60, 80
@@ -187,6 +188,22 @@ def test_a_human_on_another_body_is_refused(addon, picture):
     person = a_human()
     with refused(RuntimeError, person.name, "body"):
         bpy.ops.primdiffusion.human_from_picture(human=person.name)
+
+
+def test_a_picture_dropped_onto_the_view_is_chosen_while_the_tab_is_open(addon):
+    handler = bpy.types.PRIMDIFFUSION_FH_picture
+    assert handler.bl_import_operator == PRIMDIFFUSION_OT_choose_picture.bl_idname
+    assert set(handler.bl_file_extensions.split(";")) == {".png", ".jpg", ".jpeg"}
+
+    def taken(area: str, tab: str, sidebar: bool = True) -> bool:
+        regions = [SimpleNamespace(type="WINDOW"), SimpleNamespace(type="UI", active_panel_category=tab)]
+        space = SimpleNamespace(show_region_ui=sidebar)
+        return handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type=area, regions=regions), space_data=space))
+
+    assert taken("VIEW_3D", "PrimDiffusion")
+    assert not taken("VIEW_3D", "Item")
+    assert not taken("VIEW_3D", "PrimDiffusion", sidebar=False)
+    assert not taken("IMAGE_EDITOR", "PrimDiffusion")
 
 
 def test_progress_is_shown_and_cancel_leaves_no_human(chosen, monkeypatch):
