@@ -3,8 +3,8 @@
     python -m scripts.renew_closed_form --people people --more earlier_people --out start.safetensors
     primdiffusion train --start-from start.safetensors --data people --run runs/next
 
-The included checkpoint was made so. Plain colourings of `--more` count for the closed form alone. The network over
-person components goes: its components are others now. The local network keeps its weights for what has not changed.
+Plain colourings of `--more` count for the closed form alone. The network over person components goes: its components
+are others now. The local network keeps its weights for what has not changed.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class PriorConfig:
     """Values of `heads` with hair that hangs over the clothes and covers a part of them."""
     features: tuple[tuple[str, ...], ...] = (("shoes",),)
     """Further attributes that shift the mean, each list independently."""
-    axes: int = 96
+    axes: int = 64
     """Principal axes of a covariance."""
     shared: int = 4
     """Directions of the skin, which clothes and heads share; as many of the hair of each style in `hanging`."""
