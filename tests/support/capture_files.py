@@ -3,8 +3,8 @@
 import contextlib
 from pathlib import Path
 
+from blender_primdiffusion.formats.capture_layout import LIST_FILE, RELEASED_REFERENCE, picture_path, read_about
 from PIL import Image
-from primdiffusion.formats.capture_layout import LIST_FILE, RELEASED_REFERENCE, picture_path, read_about
 
 
 def faults(root: Path) -> list[str]:
