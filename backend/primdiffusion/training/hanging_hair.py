@@ -37,7 +37,7 @@ def find_hanging_hair(
     Args:
         bare: coefficients of people with bare clothes, without their means.
         own: the same of people with the hair, with head.
-        inside: the components; the last o coefficients are not those of clothes.
+        inside: the components; the leading o coefficients are those of clothes.
         directions: q, number of directions of the hair's colour.
     """
     clothes = bare.shape[1]
@@ -57,6 +57,7 @@ def find_hanging_hair(
         explained = torch.einsum("bq,qkd->bkd", design, fitted)
         chance = (drawn - explained).square().sum((0, 2)) * freedoms / max(len(own) - freedoms, 1)
         known = (1 - chance / explained.square().sum((0, 2)).clamp_min(1e-12)).clamp_min(0)
+        known = known * (len(own) > freedoms)  # so few people are explained by any design
         changes.append(torch.einsum("qkd,k,nkd->qn", fitted, known, basis))
     change = torch.cat(changes, dim=1)
     of_head = tones.T @ own[:, clothes:] / len(own)

@@ -65,7 +65,7 @@ def fit_mixture(
     garments = [tuple(v for name, v in zip(groups, row, strict=True) if name != "sex") for row in rows[0]]
     skin, skin_of_head, remainder = _skin(remainder, clothes, rows[0], choices[0], garments, config)
     style_of = [_hanging(head, heads, vocabulary, config) for head in choices[1]]
-    if all(style_of) or clothes == c.shape[1]:  # nobody shows the clothes below, or heads are not told from clothes
+    if all(style_of) or clothes == c.shape[1]:  # no bare clothes to compare with, or no part for the head
         style_of = [None] * len(style_of)
     styles = [style_of[choices[1].index(head)] for head in rows[1]]
     bare = torch.tensor([style is None for style in styles])

@@ -188,6 +188,13 @@ def test_hair_covers_clothes_in_its_own_colour_and_leaves_other_people_none():
     assert of_long[2].item() == pytest.approx(4, rel=0.4)
 
 
+def test_few_people_with_hanging_hair_do_not_say_how_it_covers_clothes():
+    few = [{**DRESS, "hair": hair, "shoes": "boots"} for hair in ("bob",) * 20 + ("long",) * 3]
+    c = torch.randn(len(few), CLOTHES + 2, generator=torch.Generator().manual_seed(1))
+    mixture = fitted(few, c)
+    assert not mixture.shared[part(mixture, **DRESS, hair="long", shoes="boots")[0], 1].any()
+
+
 def test_people_of_whom_nothing_is_known_are_one_gaussian():
     unknown = torch.zeros(len(PEOPLE), 0)
     mixture = SimpleNamespace(**fit_mixture(components(), CLOTHES, unknown, NOTHING, CONFIG, ONE_EACH))
