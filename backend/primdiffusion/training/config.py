@@ -45,6 +45,11 @@ class PriorConfig:
     ignored."""
     heads: tuple[str, ...] = ("sex", "hair", "hat")
     """Attributes that define the heads, each with its own covariance."""
+    outfit: str = "outfit"
+    """The one of `groups` that says what is worn. Colours have one covariance for all who wear the same, as far as their
+    group has too few people for its own."""
+    hair: str = "hair"
+    """The same of `heads`."""
     hanging: tuple[str, ...] = ("long", "ponytail", "braid")
     """Values of `heads` with hair that hangs over the clothes and covers a part of them."""
     features: tuple[tuple[str, ...], ...] = (("shoes",),)
@@ -53,8 +58,8 @@ class PriorConfig:
     """Principal axes of a covariance."""
     shared: int = 4
     """Directions of the skin, which clothes and heads share; as many of the hair of each style in `hanging`."""
-    lean: float = 4.0
-    """Shrinkage of the groups' covariances to those of all data: its weight as samples."""
+    lean: float = 10.0
+    """Shrinkage of the details in the groups' covariances to those of all data: its weight as samples."""
     folds: int = 4
     """Folds of the cross-validation that measures how much variance of each component generalises to new people."""
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.diffusion.components import PersonComponents
+from primdiffusion.training.regression import principal_directions, regress_cells
 
 COLOURS = 8
 """Principal directions of bare clothes in which their colour is looked for."""
@@ -48,25 +49,8 @@ def find_hanging_hair(
     of_hair, hair = principal_directions(own[:, first:], directions)
     tones = own[:, first:] @ hair / of_hair
     design = torch.cat([scores / deviation, tones], dim=1)
-    freedoms = design.shape[1]
-    away = (own[:, :clothes] - scores @ colour.T).split(len(inside.basis), dim=1)
-    changes = []
-    for basis, part in zip(inside.bases(), away, strict=False):  # the last are not of clothes
-        drawn = torch.einsum("bn,nkd->bkd", part, basis)
-        fitted = torch.linalg.lstsq(design, drawn.flatten(1)).solution.unflatten(1, drawn.shape[1:])
-        explained = torch.einsum("bq,qkd->bkd", design, fitted)
-        chance = (drawn - explained).square().sum((0, 2)) * freedoms / max(len(own) - freedoms, 1)
-        known = (1 - chance / explained.square().sum((0, 2)).clamp_min(1e-12)).clamp_min(0)
-        known = known * (len(own) > freedoms)  # so few people are explained by any design
-        changes.append(torch.einsum("qkd,k,nkd->qn", fitted, known, basis))
-    change = torch.cat(changes, dim=1)
+    change, _ = regress_cells(own[:, :clothes] - scores @ colour.T, design, inside)
     of_head = tones.T @ own[:, clothes:] / len(own)
     becomes = colour.T * seen[:, None] + (seen / deviation)[:, None] * change[: len(seen)]
     through = torch.eye(clothes) + colour @ (becomes - colour.T)
     return HangingHair(through, change[len(seen) :], of_head), own[:, clothes:] - tones @ of_head
-
-
-def principal_directions(c: Float[Tensor, "n i"], count: int) -> tuple[Float[Tensor, "q"], Float[Tensor, "i q"]]:
-    """Standard deviations along the leading principal directions, and these as columns."""
-    value, vector = torch.linalg.eigh((c.T @ c).double() / len(c))
-    return value.flip(0)[:count].clamp_min(1e-12).sqrt().float(), vector.flip(1)[:, :count].float()

@@ -26,15 +26,16 @@ from primdiffusion.diffusion.gaussian import IMPOSSIBLE, PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.editing.regions import region_of
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.hanging_hair import HangingHair, find_hanging_hair, principal_directions
+from primdiffusion.training.hanging_hair import HangingHair, find_hanging_hair
 from primdiffusion.training.latents import CHUNK, LatentSet
+from primdiffusion.training.regression import RIDGE, principal_directions, regress_cells
 
-RIDGE = 4.0
-"""People without any effect that every effect is estimated with."""
 PASSES = 4
 """Rounds of backfitting."""
 SAME_GARMENTS = 0.5
-"""What a person of the other sex in the same garments counts for a group's covariance."""
+"""What a person of another group in the same garments counts for a group's covariance."""
+GROUP_COLOURS = 4
+"""Principal directions of a group in which its colours differ."""
 
 Values = tuple[int, ...]
 """The value of each of some attributes, as its number in the vocabulary; -1 where unknown."""
@@ -62,15 +63,18 @@ def fit_mixture(
     rows = [[tuple(values[name][i] for name in key) for i in range(len(c))] for key in keys]
     choices = [sorted(set(row)) for row in rows]
     effects, remainder = _effects(c, clothes, rows, choices)
-    garments = [tuple(v for name, v in zip(groups, row, strict=True) if name != "sex") for row in rows[0]]
-    skin, skin_of_head, remainder = _skin(remainder, clothes, rows[0], choices[0], garments, config)
+    outfits, hairs = (
+        [tuple(v for name, v in zip(key, choice, strict=True) if name == kept) for choice in options]
+        for key, options, kept in zip((groups, heads), choices, (config.outfit, config.hair), strict=False)
+    )
+    worn = [outfits[choices[0].index(group)] for group in rows[0]]
+    skin, skin_of_head, remainder = _skin(remainder, clothes, rows[0], choices[0], worn, inside, config)
     style_of = [_hanging(head, heads, vocabulary, config) for head in choices[1]]
     if all(style_of) or clothes == c.shape[1]:  # no bare clothes to compare with, or no part for the head
         style_of = [None] * len(style_of)
     styles = [style_of[choices[1].index(head)] for head in rows[1]]
     bare = torch.tensor([style is None for style in styles])
-    of_group = [garments[rows[0].index(group)] for group in choices[0]]
-    covariances = _covariances(remainder[bare, :clothes], list(compress(rows[0], bare)), choices[0], of_group, config)
+    covariances = _covariances(remainder[bare, :clothes], list(compress(rows[0], bare)), choices[0], outfits, config)
     hair: dict[str | None, HangingHair] = {}
     for style in sorted(set(filter(None, styles))):
         own = torch.tensor([each == style for each in styles])
@@ -82,7 +86,7 @@ def fit_mixture(
         torch.eye(clothes), torch.zeros(directions, clothes), torch.zeros(directions, c.shape[1] - clothes)
     )
     head_shared = torch.stack([torch.cat([skin_of_head, hair[style].of_head]) for style in style_of])
-    head_axes = _axes(_covariances(remainder[:, clothes:], rows[1], choices[1], choices[1], config), config)
+    head_axes = _axes(_covariances(remainder[:, clothes:], rows[1], choices[1], hairs, config), config)
     below = [
         (g, style, kinds)
         for g, group in enumerate(choices[0])
@@ -119,13 +123,14 @@ def _skin(
     clothes: int,
     group: Sequence[Values],
     groups: Sequence[Values],
-    garments: Sequence[Values],
+    worn: Sequence[Values],
+    inside: PersonComponents,
     config: PriorConfig,
 ) -> tuple[Float[Tensor, "g q o"], Float[Tensor, "q s"], Float[Tensor, "n r"]]:
     """Directions of the skin in the clothes of each group and in the head, and what they leave.
 
-    Hands are bare in every outfit, so their leading principal directions are those of skin. Bare legs have its tone,
-    trousers do not: so clothes have a regression for each outfit, as far as they show it.
+    Hands are bare in every outfit, so their leading principal directions are those of skin. Cells that an outfit leaves
+    bare have its tone, those that it covers do not.
     """
     hands = c[:, clothes : (c.shape[1] + clothes) // 2]
     deviation, vector = principal_directions(hands, config.shared)
@@ -133,12 +138,12 @@ def _skin(
     on_head = scores.T @ c[:, clothes:] / len(c)
     shared, remainder = c.new_zeros(len(groups), scores.shape[1], clothes), c.clone()
     remainder[:, clothes:] -= scores @ on_head
-    for g, values in enumerate(groups):
-        of_group = torch.tensor([v == values for v in group])
-        garment = garments[group.index(values)]
-        alike = torch.tensor([v == garment for v in garments])
-        shared[g], unknown = _shown(c[alike, :clothes], scores[alike], scores.shape[1])
-        remainder[of_group, :clothes] -= (1 - unknown) * (scores[of_group] @ shared[g])
+    for outfit in set(worn):
+        own = torch.tensor([v == outfit for v in worn])
+        shown, away = regress_cells(c[own, :clothes], scores[own], inside)
+        remainder[own, :clothes] -= scores[own] @ away
+        for g in {groups.index(v) for v, is_own in zip(group, own, strict=True) if is_own}:
+            shared[g] = shown
     return shared, on_head, remainder
 
 
@@ -215,23 +220,33 @@ def _covariances(
     c: Float[Tensor, "n i"],
     group: Sequence[Values],
     groups: Sequence[Values],
-    garments: Sequence[Values],
+    worn: Sequence[Values],
     config: PriorConfig,
 ) -> list[Float[Tensor, "i i"]]:
-    """Covariance of each group's people.
+    """Covariance of each group's people: that of their colours and that of details.
 
-    Those of groups in the same `garments` count by half, and `config.lean` of all groups alike in the last value.
+    Colours are the leading principal directions of all people who wear the same, whatever their sex and pattern. Of
+    details, which are what colours leave, `config.lean` people are those of all groups alike in the last value: their
+    colours would be sleeves that differ from the shirt.
     """
-    members = [torch.tensor([v == values for v in group]) for values in groups]
-    counts = torch.tensor([float(one.sum()) for one in members])
-    scatter = torch.stack([c[one].T @ c[one] for one in members])
-    covariances = []
-    for g, own in enumerate(groups):
-        alike = torch.tensor([float(values[-1:] == own[-1:]) for values in groups])
-        share = torch.tensor([SAME_GARMENTS * (worn == garments[g]) for worn in garments])
-        share[g] = 1.0
-        share += config.lean * alike / (alike @ counts).clamp_min(1)
-        covariances.append(torch.einsum("h,hij->ij", share / (share @ counts).clamp_min(1e-6), scatter))
+    if not len(c):
+        return [torch.zeros(c.shape[1], c.shape[1]) for _ in groups]
+    members = torch.stack([torch.tensor([float(v == values) for v in group]) for values in groups])
+    same = torch.tensor([[float(one == other) for other in worn] for one in worn])
+    alike = torch.tensor([[float(one[-1:] == other[-1:]) for other in groups] for one in groups])
+    detail, colours = torch.empty_like(c), []
+    for g, own in enumerate(members):
+        weight = SAME_GARMENTS * (same[g] @ members) + (1 - SAME_GARMENTS) * own
+        weight = weight if float(weight.sum()) else torch.ones_like(own)
+        deviation, direction = principal_directions(c * (weight * len(c) / weight.sum()).sqrt()[:, None], GROUP_COLOURS)
+        colours.append((direction * deviation.square()) @ direction.T)
+        detail[own > 0] = (c - c @ direction @ direction.T)[own > 0]
+    scatter = torch.stack([(detail * own[:, None]).T @ detail for own in members])
+    counts, covariances = members.sum(1), []
+    for g, colour in enumerate(colours):
+        share = SAME_GARMENTS * same[g] * alike[g] + config.lean * alike[g] / (alike[g] @ counts).clamp_min(1)
+        share[g] += 1 - SAME_GARMENTS
+        covariances.append(colour + torch.einsum("h,hij->ij", share / (share @ counts).clamp_min(1e-6), scatter))
     return covariances
 
 
