@@ -46,8 +46,8 @@ class PriorConfig:
     heads: tuple[str, ...] = ("sex", "hair", "hat")
     """Attributes that define the heads, each with its own covariance."""
     outfit: str = "outfit"
-    """The one of `groups` that says what is worn. Colours have one covariance for all who wear the same, as far as their
-    group has too few people for its own."""
+    """The one of `groups` that says what is worn: all who wear the same share the covariance of colours, and show skin
+    in the same places."""
     hair: str = "hair"
     """The same of `heads`."""
     hanging: tuple[str, ...] = ("long", "ponytail", "braid")

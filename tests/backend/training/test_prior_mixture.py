@@ -8,7 +8,7 @@ from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.prior import fit_mixture
+from primdiffusion.training.mixture import fit_mixture
 
 WORDS = AttributeVocabulary(
     {
@@ -150,6 +150,21 @@ def test_the_other_sex_in_the_same_garments_counts_by_half():
     women_s, men_s = (variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[3].item() for g in range(2))
     assert women_s == pytest.approx(4 * 20 / (10 + 20), rel=0.3)
     assert men_s == pytest.approx(4 * 40 / (40 + 5), rel=0.3)
+
+
+def test_details_of_others_are_lent_but_not_their_colours():
+    # a dress is of one cloth; of jeans, two parts have colours of their own, and a fifth has detail
+    women, men = [PEOPLE[400]] * 200, [{**DRESS, "hair": "bob", "shoes": "boots"}] * 12
+    c = 0.01 * torch.randn(212, CLOTHES + 2, generator=torch.Generator().manual_seed(0))
+    c[:200, :4] *= 300
+    c[:200, 4] *= 50
+    c[200:, :2] += 2 * torch.randn(12, 1, generator=torch.Generator().manual_seed(1))
+    dress = fitted(women + men, c, PriorConfig(groups=("outfit", "sex"), lean=10.0, axes=4, shared=1))
+    g = part(dress, **DRESS, hair="bob", shoes="boots")[0]
+    own = dress.axes[g].T @ torch.diag(dress.variance[g] - dress.left[g]) @ dress.axes[g]
+    seam = torch.tensor([1.0, -1.0, 0.0, 0.0, 0.0])
+    assert seam @ own @ seam + 2 * dress.left[g] < 0.05
+    assert (own + dress.left[g] * torch.eye(CLOTHES))[4, 4].item() == pytest.approx(0.25 * 10 / 22, rel=0.3)
 
 
 def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):

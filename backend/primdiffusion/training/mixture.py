@@ -1,0 +1,304 @@
+"""Fit a mixture of Gaussians over person components.
+
+The mixture has all kinds of person that the training people suggest. Kinds are many (16 outfits of a sex, 9 styles of
+hair and hat, 6 pairs of shoes, plain or patterned) and people of one kind few or none, so kinds share what they can: a
+covariance of clothes for each group (sex, outfit and pattern) and one of the head for each hair style, for which small
+groups lean on their like, and a mean that is a sum of effects: of the group, of the hair, of the shoes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from primdiffusion.diffusion.components import PersonComponents
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.diffusion.gaussian import IMPOSSIBLE
+from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.hanging_hair import HangingHair, find_hanging_hair
+from primdiffusion.training.regression import RIDGE, principal_directions, regress_cells
+
+PASSES = 4
+"""Rounds of backfitting."""
+SAME_GARMENTS = 0.5
+"""What a person of another group in the same garments counts for a group's covariance."""
+GROUP_COLOURS = 4
+"""Principal directions of a group in which its colours differ."""
+
+
+class Key(NamedTuple):
+    """Attributes that are chosen together, and the choices that people make of their values."""
+
+    names: list[str]
+    choices: list[tuple[int, ...]]
+    """Numbers of the values in the vocabulary; -1 where unknown."""
+    of_person: Int[Tensor, "n"]
+    """The number of each person's choice."""
+
+    def design(self) -> Float[Tensor, "n v"]:
+        """1 where a person has made a choice, else 0."""
+        return functional.one_hot(self.of_person, len(self.choices)).float()
+
+    def alike(self, name: str) -> Float[Tensor, "v v"]:
+        """1 where two choices have the same value of an attribute, which all have if it is none of theirs; else 0."""
+        values = [[v for own, v in zip(self.names, choice, strict=True) if own == name] for choice in self.choices]
+        return torch.tensor([[float(one == other) for other in values] for one in values])
+
+
+class Kind(NamedTuple):
+    """A group, a head and features that go together."""
+
+    share: float
+    """Its share of people."""
+    choices: tuple[int, ...]
+    """The number of its choice of each key."""
+
+
+def fit_mixture(
+    c: Float[Tensor, "n r"],
+    clothes: int,
+    condition: Float[Tensor, "n x"],
+    vocabulary: AttributeVocabulary,
+    config: PriorConfig,
+    inside: PersonComponents,
+) -> dict[str, Tensor]:
+    """Kinds, as fields of `PersonPrior`, for all that can be put together of the people's attributes; a single one if
+    they have none.
+
+    The leading `clothes` coefficients are those of the clothes, the others the head's.
+    """
+    keys = _keys(condition, vocabulary, config)
+    groups, heads = keys[:2]
+    effects, remainder = _effects(c, clothes, keys)
+    skin, skin_of_head, remainder = _skin(remainder, clothes, groups, inside, config)
+    styles, style_of, remainder = _hair(remainder, clothes, heads, vocabulary, inside, config)
+    bare = (style_of == 0)[heads.of_person]
+    of_bare = groups._replace(of_person=groups.of_person[bare])
+    covariances = _covariances(remainder[bare, :clothes], of_bare, config.outfit, config.lean)
+    below = [
+        (covariances[g], skin[g], style, kinds)
+        for g in range(len(groups.choices))
+        for number, style in enumerate(styles)
+        if (kinds := [kind for kind in _kinds(g, keys) if style_of[kind.choices[1]] == number])
+    ]
+    axes = _axes([style.through.T @ covariance @ style.through for covariance, _, style, _ in below], config.axes)
+    head_axes = _axes(_covariances(remainder[:, clothes:], heads, config.hair, config.lean), config.axes)
+    return {
+        "axes": axes[0], "variance": axes[1], "left": axes[2],
+        "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
+        "shared": torch.stack([torch.cat([tone @ style.through, style.of_clothes]) for _, tone, style, _ in below]),
+        "head_shared": torch.stack([torch.cat([skin_of_head, styles[number].of_head]) for number in style_of]),
+        **_kind_fields([(style.through, kinds) for *_, style, kinds in below], effects, c.mean(0), keys, vocabulary),
+    }  # fmt: skip
+
+
+def _keys(condition: Float[Tensor, "n x"], vocabulary: AttributeVocabulary, config: PriorConfig) -> list[Key]:
+    """Groups, heads, and those features of which the people have an attribute."""
+    values = {}
+    for name, block in vocabulary.blocks().items():
+        known = condition[:, block]
+        values[name] = torch.where(known.amax(1) > 0, known.argmax(1), -1).tolist()
+    keys = []
+    for number, wanted in enumerate((config.groups, config.heads, *config.features)):
+        names = [name for name in wanted if name in vocabulary.categories]
+        if names or number < 2:
+            rows = [tuple(values[name][person] for name in names) for person in range(len(condition))]
+            choices = sorted(set(rows))
+            keys.append(Key(names, choices, torch.tensor([choices.index(row) for row in rows])))
+    return keys
+
+
+def _effects(
+    c: Float[Tensor, "n r"], clothes: int, keys: Sequence[Key]
+) -> tuple[list[Float[Tensor, "v r"]], Float[Tensor, "n r"]]:
+    """What every choice of every key adds to the mean, and what they leave, by backfitting.
+
+    Groups say what clothes are like, and heads what hands and head are like. The other keys add what they show to:
+    long hair hangs over a collar, but the shirts of the few people who have it do not colour everybody's.
+    """
+    designs = [key.design() for key in keys]
+    effects, remainder = [torch.zeros(len(key.choices), c.shape[1]) for key in keys], c - c.mean(0)
+    for part, first in ((slice(0, clothes), 0), (slice(clothes, None), 1)):
+        unknown: dict[int, Tensor] = {}
+        for key in (first, *(k for k in range(len(keys)) if k != first)) * PASSES:
+            design = designs[key]
+            left = remainder[:, part] + design @ effects[key][:, part]
+            if key == first:
+                effect, unknown[key] = _ridge(left, design), torch.zeros(left.shape[1])
+            else:
+                effect, unknown[key] = _shown(left, design, design.shape[1] - 1)
+            effects[key][:, part] = effect
+            remainder[:, part] = left - design @ effect
+        for key, share in unknown.items():
+            remainder[:, part] += share * (designs[key] @ effects[key][:, part])
+    return effects, remainder
+
+
+def _ridge(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"]) -> Float[Tensor, "v r"]:
+    """Coefficients by ridge regression on a design."""
+    normal = design.T @ design + RIDGE * torch.eye(design.shape[1])
+    return torch.linalg.solve(normal.double(), (design.T @ c).double()).float()
+
+
+def _shown(
+    c: Float[Tensor, "n r"], design: Float[Tensor, "n v"], freedoms: int
+) -> tuple[Float[Tensor, "v r"], Float[Tensor, "r"]]:
+    """As `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
+
+    F compares what the design's degrees of freedom explain with what they would explain by chance. The second is how
+    much of the shrunk part belongs to what is left, independent of it, so that the variance stays what it was.
+    """
+    effect = _ridge(c, design)
+    fitted = design @ effect
+    chance = (c - fitted).square().sum(0) * freedoms / max(len(c) - freedoms, 1)
+    s = (1 - chance / fitted.square().sum(0).clamp_min(1e-12)).clamp(1e-6, 1)
+    people = design.square().sum(0)
+    shrunk = s * (people / (people + RIDGE)).mean()
+    return s * effect, 1 - (1 - (1 - shrunk**2).sqrt()) / shrunk
+
+
+def _skin(
+    c: Float[Tensor, "n r"], clothes: int, groups: Key, inside: PersonComponents, config: PriorConfig
+) -> tuple[Float[Tensor, "g q o"], Float[Tensor, "q s"], Float[Tensor, "n r"]]:
+    """Directions of the skin in the clothes of each group and in the head, and what they leave.
+
+    Hands are bare in every outfit, so their leading principal directions are those of skin. Cells that an outfit leaves
+    bare have its tone, those that it covers do not.
+    """
+    hands = c[:, clothes : (c.shape[1] + clothes) // 2]
+    deviation, vector = principal_directions(hands, config.shared)
+    scores = hands @ vector / deviation
+    on_head = scores.T @ c[:, clothes:] / len(c)
+    shared, remainder = c.new_zeros(len(groups.choices), scores.shape[1], clothes), c.clone()
+    remainder[:, clothes:] -= scores @ on_head
+    for same in groups.alike(config.outfit).bool().unique(dim=0):
+        own = same[groups.of_person]
+        shared[same], away = regress_cells(c[own, :clothes], scores[own], inside)
+        remainder[own, :clothes] -= scores[own] @ away
+    return shared, on_head, remainder
+
+
+def _hair(
+    c: Float[Tensor, "n r"],
+    clothes: int,
+    heads: Key,
+    vocabulary: AttributeVocabulary,
+    inside: PersonComponents,
+    config: PriorConfig,
+) -> tuple[list[HangingHair], Int[Tensor, "f"], Float[Tensor, "n r"]]:
+    """Styles of hair, of which the first covers no clothes, the number of each head's style, and what styles leave."""
+    names = [""]
+    style_of = torch.zeros(len(heads.choices), dtype=torch.int64)
+    for head, choice in enumerate(heads.choices):
+        words = [vocabulary.categories[name][v] for name, v in zip(heads.names, choice, strict=True) if v >= 0]
+        style = next((word for word in words if word in config.hanging), "")
+        names += [style] * (style not in names)
+        style_of[head] = names.index(style)
+    if style_of.all() or clothes == c.shape[1]:  # no bare clothes to compare with, or no part for the head
+        names, style_of = [""], torch.zeros_like(style_of)
+    of_person, remainder, found = style_of[heads.of_person], c.clone(), []
+    for number in range(1, len(names)):
+        own = of_person == number
+        style, remainder[own, clothes:] = find_hanging_hair(c[of_person == 0, :clothes], c[own], inside, config.shared)
+        found.append(style)
+    directions = len(found[0].of_head) if found else 0
+    none = c.new_zeros(directions, c.shape[1]).split([clothes, c.shape[1] - clothes], dim=1)
+    return [HangingHair(torch.eye(clothes), *none), *found], style_of, remainder
+
+
+def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> list[Float[Tensor, "i i"]]:
+    """Covariance of each choice's people: that of their colours and that of details.
+
+    Colours are the leading principal directions of all people who have the same of `worn`, whatever their sex and
+    pattern. Of details, which are what colours leave, `lean` people are those of all choices alike in the last
+    attribute: their colours would be sleeves that differ from the shirt.
+    """
+    if not len(c):
+        return [torch.zeros(c.shape[1], c.shape[1]) for _ in key.choices]
+    members, same, alike = key.design().T, key.alike(worn), key.alike(key.names[-1] if key.names else "")
+    detail, colours = torch.empty_like(c), []
+    for g, own in enumerate(members):
+        weight = SAME_GARMENTS * (same[g] @ members) + (1 - SAME_GARMENTS) * own
+        weight = weight if float(weight.sum()) else torch.ones_like(own)
+        deviation, direction = principal_directions(c * (weight * len(c) / weight.sum()).sqrt()[:, None], GROUP_COLOURS)
+        colours.append((direction * deviation.square()) @ direction.T)
+        detail[own > 0] = (c - c @ direction @ direction.T)[own > 0]
+    scatter = torch.stack([(detail * own[:, None]).T @ detail for own in members])
+    counts, covariances = members.sum(1), []
+    for g, colour in enumerate(colours):
+        share = SAME_GARMENTS * same[g] * alike[g] + lean * alike[g] / (alike[g] @ counts).clamp_min(1)
+        share[g] += 1 - SAME_GARMENTS
+        covariances.append(colour + torch.einsum("h,hij->ij", share / (share @ counts).clamp_min(1e-6), scatter))
+    return covariances
+
+
+def _axes(
+    covariances: Sequence[Float[Tensor, "i i"]], count: int
+) -> tuple[Float[Tensor, "g a i"], Float[Tensor, "g a"], Float[Tensor, "g"]]:
+    """`count` principal axes and variances of each covariance, and the mean variance of all directions left."""
+    axes, variances, left = [], [], []
+    for covariance in covariances:
+        value, vector = torch.linalg.eigh(covariance.double())
+        value = value.flip(0).clamp_min(max(float(value.max()) * 1e-7, 1e-12) if len(value) else 0.0)
+        kept = min(count, len(value))
+        axes.append(vector.flip(1)[:, :kept].T.float())
+        variances.append(value[:kept].float())
+        left.append(value[kept:].mean().float() if kept < len(value) else torch.tensor(0.0))
+    return torch.stack(axes), torch.stack(variances), torch.stack(left)
+
+
+def _kinds(group: int, keys: Sequence[Key]) -> list[Kind]:
+    """Every kind of a group: all choices of the other keys that go with it.
+
+    They go with a group where the attributes that both name agree; their shares are those among all people of whom
+    these attributes are true.
+    """
+    groups = keys[0]
+    kinds = [Kind(float((groups.of_person == group).float().mean()), (group,))]
+    for key in keys[1:]:
+        counts = torch.bincount(key.of_person, minlength=len(key.choices))
+        both = [(key.names.index(name), groups.names.index(name)) for name in key.names if name in groups.names]
+        fitting = [
+            number
+            for number, choice in enumerate(key.choices)
+            if all(choice[mine] == groups.choices[group][theirs] for mine, theirs in both)
+        ]
+        shares = [float(counts[number] / counts[fitting].sum()) for number in fitting]
+        kinds = [
+            Kind(kind.share * share, (*kind.choices, number))
+            for kind in kinds
+            for number, share in zip(fitting, shares, strict=True)
+        ]
+    return kinds
+
+
+def _kind_fields(
+    below: Sequence[tuple[Float[Tensor, "o o"], Sequence[Kind]]],
+    effects: Sequence[Float[Tensor, "v r"]],
+    mean: Float[Tensor, "r"],
+    keys: Sequence[Key],
+    vocabulary: AttributeVocabulary,
+) -> dict[str, Tensor]:
+    """Weights, centres, heads and conditions of kinds, whose clothes are seen through hair."""
+    size = len(below), max(len(kinds) for _, kinds in below)
+    log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
+    centre, condition = torch.zeros(*size, len(mean)), torch.zeros(*size, vocabulary.width)
+    blocks = vocabulary.blocks()
+    for g, (through, kinds) in enumerate(below):
+        for m, kind in enumerate(kinds):
+            own, *others = (effect[number] for effect, number in zip(effects, kind.choices, strict=True))
+            own = torch.cat([own[: len(through)] @ through, own[len(through) :]])
+            log_weight[g, m], head[g, m] = kind.share, kind.choices[1]
+            centre[g, m] = torch.stack([mean, own, *others]).sum(0)
+            for key, number in zip(keys, kind.choices, strict=True):
+                for name, value in zip(key.names, key.choices[number], strict=True):
+                    if value >= 0:
+                        condition[g, m, blocks[name].start + value] = 1.0
+    real = log_weight > 0
+    log_weight[real] = (log_weight[real] / log_weight[real].sum()).log()
+    return {"log_weight": log_weight, "head": head, "centre": centre, "kind": condition}
