@@ -3,7 +3,8 @@
     python -m scripts.renew_closed_form --people people --more earlier_people --out start.safetensors
     primdiffusion train --start-from start.safetensors --data people --run runs/next
 
-Plain colourings of `--more` count for the closed form alone. The network over person components goes: its components
+People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
+for the closed form alone. The network over person components goes: its components
 are others now. The local network keeps its weights for what has not changed.
 """
 
@@ -21,7 +22,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.latents import LatentSet, encode_people, vocabulary_of
+from primdiffusion.training.latents import LatentSet, encode_people, split_people, vocabulary_of
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from torch import Tensor
 
@@ -34,13 +35,16 @@ def main() -> None:
     parser.add_argument("--without", nargs="*", default=["suit"], help="outfits of --more that are left out")
     parser.add_argument("--channels", type=int, default=96, help="leading latent channels of person components")
     parser.add_argument("--axes", type=int, default=64, help="principal axes of a covariance")
+    parser.add_argument("--holdout", type=float, default=0.05, help="share of --people left out, as by training")
+    parser.add_argument("--seed", type=int, default=0, help="seed of training, which says who is left out")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     base = load_checkpoint(arguments.base)
     assert isinstance(base.codec, CellCodec)
     codec, people = base.codec.codec, PersonFolder(arguments.people)
     vocabulary = vocabulary_of(known for index in range(len(people.names)) for known in people.known(index))
-    latents = encode_people(people, range(len(people.names)), codec, vocabulary)
+    fitted, _ = split_people(range(len(people.names)), arguments.holdout, arguments.seed)
+    latents = encode_people(people, fitted, codec, vocabulary)
     if arguments.more is not None:
         more = PersonFolder(arguments.more)
         others = encode_people(more, range(len(more.names)), codec, vocabulary)

@@ -124,18 +124,12 @@ def _effects(
     designs = [key.design() for key in keys]
     effects, remainder = [torch.zeros(len(key.choices), c.shape[1]) for key in keys], c - c.mean(0)
     for part, first in ((slice(0, clothes), 0), (slice(clothes, None), 1)):
-        unknown: dict[int, Tensor] = {}
         for key in (first, *(k for k in range(len(keys)) if k != first)) * PASSES:
             design = designs[key]
             left = remainder[:, part] + design @ effects[key][:, part]
-            if key == first:
-                effect, unknown[key] = _ridge(left, design), torch.zeros(left.shape[1])
-            else:
-                effect, unknown[key] = _shown(left, design, design.shape[1] - 1)
+            effect = _ridge(left, design) if key == first else _shown(left, design, design.shape[1] - 1)
             effects[key][:, part] = effect
             remainder[:, part] = left - design @ effect
-        for key, share in unknown.items():
-            remainder[:, part] += share * (designs[key] @ effects[key][:, part])
     return effects, remainder
 
 
@@ -145,21 +139,15 @@ def _ridge(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"]) -> Float[Tenso
     return torch.linalg.solve(normal.double(), (design.T @ c).double()).float()
 
 
-def _shown(
-    c: Float[Tensor, "n r"], design: Float[Tensor, "n v"], freedoms: int
-) -> tuple[Float[Tensor, "v r"], Float[Tensor, "r"]]:
+def _shown(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"], freedoms: int) -> Float[Tensor, "v r"]:
     """As `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
 
-    F compares what the design's degrees of freedom explain with what they would explain by chance. The second is how
-    much of the shrunk part belongs to what is left, independent of it, so that the variance stays what it was.
+    F compares what the design's degrees of freedom explain with what they would explain by chance.
     """
     effect = _ridge(c, design)
     fitted = design @ effect
     chance = (c - fitted).square().sum(0) * freedoms / max(len(c) - freedoms, 1)
-    s = (1 - chance / fitted.square().sum(0).clamp_min(1e-12)).clamp(1e-6, 1)
-    people = design.square().sum(0)
-    shrunk = s * (people / (people + RIDGE)).mean()
-    return s * effect, 1 - (1 - (1 - shrunk**2).sqrt()) / shrunk
+    return (1 - chance / fitted.square().sum(0).clamp_min(1e-12)).clamp_min(0) * effect
 
 
 def _skin(
@@ -178,8 +166,7 @@ def _skin(
     remainder[:, clothes:] -= scores @ on_head
     for same in groups.alike(config.outfit).bool().unique(dim=0):
         own = same[groups.of_person]
-        shared[same], away = regress_cells(c[own, :clothes], scores[own], inside)
-        remainder[own, :clothes] -= scores[own] @ away
+        shared[same], remainder[own, :clothes] = regress_cells(c[own, :clothes], scores[own], inside)
     return shared, on_head, remainder
 
 

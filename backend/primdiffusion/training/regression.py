@@ -18,28 +18,29 @@ RIDGE = 4.0
 
 def regress_cells(
     c: Float[Tensor, "n o"], design: Float[Tensor, "n q"], inside: PersonComponents
-) -> tuple[Float[Tensor, "q o"], Float[Tensor, "q o"]]:
-    """Regression on a design whose columns have variance 1, with each cell's part shrunk by s = 1 - 1/F (James and
-    Stein), down to 0; and what to take away from the coefficients.
+) -> tuple[Float[Tensor, "q o"], Float[Tensor, "n o"]]:
+    """Coefficients of a regression on a design whose columns have variance 1, each cell's part shrunk by
+    s = 1 - 1/F (James and Stein), down to 0; and what is left of c without as much of each cell's part.
 
     F compares what the design explains in the cell with what it would explain by chance. A cell has one for all its
-    values: a colour shows in all of them together, not in single coefficients. Of the shrunk part as much is taken away
-    as keeps the variance, if what is left is independent of it.
+    values: a colour shows in all of them together, not in single coefficients.
     """
-    freedoms = design.shape[1]
+    people, freedoms = design.shape
+    if people <= freedoms:  # so few people are explained by any design
+        return c.new_zeros(freedoms, c.shape[1]), c
+    explained = design @ torch.linalg.lstsq(design, c).solution
+    # The ridge is for columns that hardly vary among these people; the others are not to shrink with them.
     normal = design.T @ design + RIDGE * torch.eye(freedoms)
-    explains = 1 + RIDGE / len(c)  # covariance of the people with what is fitted over the variance of this
-    shown, away = [], []
-    for basis, part in zip(inside.bases(), c.split(len(inside.basis), dim=1), strict=False):  # the last may be absent
-        drawn = torch.einsum("bn,nkd->bkd", part, basis)
-        fitted = torch.linalg.solve(normal, design.T @ drawn.flatten(1)).unflatten(1, drawn.shape[1:])
-        explained = torch.einsum("bq,qkd->bkd", design, fitted)
-        chance = (drawn - explained).square().sum((0, 2)) * freedoms / max(len(c) - freedoms, 1)
-        known = (1 - chance / explained.square().sum((0, 2)).clamp_min(1e-12)).clamp_min(0)
-        known = known * (len(c) > freedoms)  # so few people are explained by any design
-        for found, share in ((shown, known), (away, explains - (explains**2 - known**2).sqrt())):
-            found.append(torch.einsum("qkd,k,nkd->qn", fitted, share, basis))
-    return torch.cat(shown, dim=1), torch.cat(away, dim=1)
+    effect = (1 + RIDGE / people) * torch.linalg.solve(normal, design.T @ c)
+    parts = (each.split(len(inside.basis), dim=1) for each in (effect, explained, c - explained))
+    shown, known = [], []
+    for basis, *of_part in zip(inside.bases(), *parts, strict=False):  # the last parts may be absent
+        fitted, found, missed = (torch.einsum("bn,nkd->bkd", each, basis) for each in of_part)
+        chance = missed.square().sum((0, 2)) * freedoms / (people - freedoms)
+        s = (1 - chance / found.square().sum((0, 2)).clamp_min(1e-12)).clamp_min(0)
+        shown.append(torch.einsum("qkd,k,nkd->qn", fitted, s, basis))
+        known.append(torch.einsum("bkd,k,nkd->bn", found, s, basis))
+    return torch.cat(shown, dim=1), c - torch.cat(known, dim=1)
 
 
 def principal_directions(c: Float[Tensor, "n i"], count: int) -> tuple[Float[Tensor, "q"], Float[Tensor, "i q"]]:

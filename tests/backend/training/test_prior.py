@@ -30,7 +30,7 @@ def test_the_prior_describes_the_people_it_was_fitted_to(prepared_once):
     z = prepared.train.latents.float()
     energy = (z - prepared.prior.mean).square().sum((1, 2, 3)).mean()
     described = prepared.prior.marginal_variance().sum() + prepared.prior.rest_variance.sum()
-    assert described.item() == pytest.approx(energy.item(), rel=0.15)
+    assert described.item() == pytest.approx(energy.item(), rel=0.2)  # less what F tests doubt
     assert prepared.prior.log_weight.shape == (2, 1)
 
 
