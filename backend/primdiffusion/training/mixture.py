@@ -201,22 +201,25 @@ def _hair(
 def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> list[Float[Tensor, "i i"]]:
     """Covariance of each choice's people: that of their colours and that of details.
 
-    Colours are the leading principal directions of all people who have the same of `worn`, whatever their sex and
-    pattern. Of details, which are what colours leave, `lean` people are those of all choices alike in the last
-    attribute: their colours would be sleeves that differ from the shirt.
+    Colours are the leading principal directions of all people who have the same of `worn`, whatever their sex; few
+    patterned people have those of many plain ones, but do not lend them their prints. Of details, which are what
+    colours leave, `lean` people are those of all choices alike in the last attribute: their colours would be sleeves
+    that differ from the shirt.
     """
     if not len(c):
         return [torch.zeros(c.shape[1], c.shape[1]) for _ in key.choices]
     members, same, alike = key.design().T, key.alike(worn), key.alike(key.names[-1] if key.names else "")
+    counts = members.sum(1)
+    lends = same * (alike + (counts[None] > counts[:, None])).clamp_max(1)
     detail, colours = torch.empty_like(c), []
     for g, own in enumerate(members):
-        weight = SAME_GARMENTS * (same[g] @ members) + (1 - SAME_GARMENTS) * own
+        weight = SAME_GARMENTS * (lends[g] @ members) + (1 - SAME_GARMENTS) * own
         weight = weight if float(weight.sum()) else torch.ones_like(own)
         deviation, direction = principal_directions(c * (weight * len(c) / weight.sum()).sqrt()[:, None], GROUP_COLOURS)
         colours.append((direction * deviation.square()) @ direction.T)
         detail[own > 0] = (c - c @ direction @ direction.T)[own > 0]
     scatter = torch.stack([(detail * own[:, None]).T @ detail for own in members])
-    counts, covariances = members.sum(1), []
+    covariances = []
     for g, colour in enumerate(colours):
         share = SAME_GARMENTS * same[g] * alike[g] + lean * alike[g] / (alike[g] @ counts).clamp_min(1)
         share[g] += 1 - SAME_GARMENTS

@@ -152,6 +152,24 @@ def test_the_other_sex_in_the_same_garments_counts_by_half():
     assert men_s == pytest.approx(4 * 40 / (40 + 5), rel=0.3)
 
 
+def test_few_patterned_people_do_not_lend_their_prints_to_many_plain_ones():
+    words = AttributeVocabulary({"outfit": ("dress",), "pattern": ("patterned", "plain")}, {})
+    people = [{"outfit": "dress", "pattern": "plain"}] * 60 + [{"outfit": "dress", "pattern": "patterned"}] * 20
+    c = 0.01 * torch.randn(80, CLOTHES + 2, generator=torch.Generator().manual_seed(0))
+    c[:, 0] += torch.randn(80, generator=torch.Generator().manual_seed(1))
+    c[60:, 1] += 3 * torch.randn(20, generator=torch.Generator().manual_seed(2))
+    condition = torch.stack([words.encode(person) for person in people])
+    config = PriorConfig(lean=1.0, axes=4, shared=1)
+    mixture = SimpleNamespace(**fit_mixture(c, CLOTHES, condition, words, config, ONE_EACH))
+    plain, patterned = (
+        variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[:2]
+        for g in ((mixture.kind[:, 0] @ words.encode({"pattern": word})).argmax() for word in ("plain", "patterned"))
+    )
+    assert plain[0].item() == pytest.approx(1, rel=0.4)
+    assert plain[1] < 0.05
+    assert patterned[1] > 3
+
+
 def test_details_of_others_are_lent_but_not_their_colours():
     # a dress is of one cloth; of jeans, two parts have colours of their own, and a fifth has detail
     women, men = [PEOPLE[400]] * 200, [{**DRESS, "hair": "bob", "shoes": "boots"}] * 12
