@@ -103,7 +103,7 @@ class PeopleCommand(MadePeople):
     """Make dressed, rigged humans as glTF files, from which captures are rendered."""
 
     out: Path
-    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
+    """Folder to write person_NNNNNN/person.glb and person.json into; complete ones are skipped."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
