@@ -252,7 +252,7 @@ class Pictures:
     """A mask for each picture, of its size: opaque or white where the person is. Pictures with alpha need none,
     nor does a single picture with a posture of its own camera, which cuts the person out (extra cutout) to mask.png."""
     mask_label: Annotated[int, Range(0, 65535)] | None = None
-    """The person's label in masks of more than two: the index in their palette, or else the grey value."""
+    """The person's label in masks of labels: the index in their palette, or else the grey value."""
     pose: Path | None = None
     """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl, .bvh), or a posture.json; without
     it, the person is taken to stand upright, facing the camera."""
