@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from tqdm import tqdm
@@ -41,6 +41,7 @@ from primdiffusion.evaluation.pretrained_networks import (
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
 from primdiffusion.evaluation.tables import (
     FRAMES_TIMED,
+    KID_SEED,
     Networks,
     Scores,
     check_counts,
@@ -121,13 +122,11 @@ class EvaluateReconstruction:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateGeneration:
-    """Measure what the paper's tables have, at 512 x 512, and the same by our own network.
+    """Measure what the paper's Tables 1 and 2 have, at 512 x 512, and the same by our own network.
 
     Weights files are of the networks that publish them.
     """
 
-    table: Literal["1", "2"] = "1"
-    """Table of the paper."""
     assets: Path | None = None
     """MakeHuman's assets, whose meshes are rendered for --real."""
     checkpoint: Path | None = None
@@ -162,8 +161,6 @@ class EvaluateGeneration:
     """Number of random subsets for KID."""
     kid_subset_size: Count = 1000
     """Pictures of each subset."""
-    kid_seed: int = 2020
-    """Seed of the subsets; torch-fidelity's default."""
 
     def run(self) -> None:
         """Evaluate, and print a table. Raises as `measure`."""
@@ -180,7 +177,6 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
     Raises:
         ValueError, FileNotFoundError: files are missing, damaged or of other networks, or there are too few pictures.
     """
-    number = int(command.table)
     poses = choose_poses([read_motion(path) for path in command.motion], command.poses, 0)
     grid = command.count * command.poses * command.views
     check_counts(*(len(folder_pictures(path)) if path is not None else grid for path in (command.fake, command.real)))
@@ -204,22 +200,20 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
         fakes = folder_images(command.fake)
     fake = _scores(fakes, networks, "generated")
     real = _scores(reals, networks, "real")
-    rows = compare_pictures(fake, real, command.kid_subsets, command.kid_subset_size, command.kid_seed)
+    rows = compare_pictures(fake, real, command.kid_subsets, command.kid_subset_size)
     if fps is not None:
         rows["generated"]["fps"] = fps
     rows["floor"] = reference_cells(networks.own.card)
-    choices = _choices(command, fake, real)
+    choices = {**_choices(command, fake, real), "resolution": resolution}
     record = {
         "version": __version__,
-        "table": number,
         "checkpoint": None if model is None else dict(model.card),
         "choices": choices,
-        "resolution": resolution,
         "rows": {row: {name: cell._asdict() for name, cell in cells.items()} for row, cells in rows.items()},
         "remarks": remarks(rows),
         "own_network": networks.own.card,
     }
-    return record, table(number, rows, choices, resolution)
+    return record, table(rows, choices)
 
 
 def _model_images(model: DiffusionModel, command: EvaluateGeneration, poses: BodyPose) -> Iterator[TestImage]:
@@ -253,7 +247,7 @@ def _choices(command: EvaluateGeneration, fake: Scores, real: Scores) -> dict[st
         "resize": f"{command.resize}, to {Inception.SIDE} for Inception and {ClipVision.SIDE} for CLIP",
         "inception": f"pool3, 2048 features, {command.inception}" if command.inception else None,
         "clip": f"image embedding of ViT-B/32, 512 features, {command.clip}" if command.clip else None,
-        "KID": f"{command.kid_subsets} subsets of {command.kid_subset_size}, seed {command.kid_seed}, cubic kernel",
+        "KID": f"{command.kid_subsets} subsets of {command.kid_subset_size}, seed {KID_SEED}, cubic kernel",
         "PCKh": f"within {PCK_SHARE} of the distance {HEAD[0]}-{HEAD[1]} in the picture, occluded joints included; "
         f"{', '.join(JOINTS)}",
         "depth error": "inverted depths inside the human, means and standard deviations aligned, mean squared "
