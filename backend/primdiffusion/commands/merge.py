@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import time
 
 import torch
 
-from primdiffusion.body.pose_file import read_pose
 from primdiffusion.commands.progress import Pace, ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
-from primdiffusion.export.merged_file import load_openvdb, upright_grid, write_grid_npz, write_grid_vdb
+from primdiffusion.export.merged_file import grid_writer, upright_grid, write_grid_npz
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
 from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
-from primdiffusion.human import Human, place_on_floor, place_skinned
+from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import Primitives
 
@@ -26,13 +24,10 @@ def merge(request: MergeRequest, session: Session, report: ReportProgress) -> Me
     began = time.perf_counter()
     if not request.out.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {request.out.parent}: create it, or choose another")
-    write = write_grid_npz
-    if request.out.suffix.lower() == ".vdb":
-        load_openvdb()
-        write = write_grid_vdb
+    write = grid_writer(request.out)
     report("merge", 0, 1, None)
     posed = [_placed(load_human(person.human), person) for person in request.people]
-    grid = upright_grid(Primitives.together(posed or _side_by_side(request)), request.voxel)
+    grid = upright_grid(Primitives.together(posed), request.voxel)
     with written_whole(request.out) as path:
         write(path, grid)
         report("merge", 1, 1, 0.0)  # the last chance to cancel
@@ -64,13 +59,3 @@ def _placed(human: Human, person: PosedPerson) -> Primitives:
         human = reshaped(human, torch.tensor(person.betas, dtype=torch.float32))
     joints, matrix = (torch.tensor(numbers, dtype=torch.float32) for numbers in (person.joints, person.object))
     return place_skinned(human, joints, matrix)
-
-
-def _side_by_side(request: MergeRequest) -> list[Primitives]:
-    pose = None if request.pose is None else read_pose(request.pose, request.frame, request.tracked_person)
-    people = []
-    for number, path in enumerate(request.humans):
-        placed = place_on_floor(load_human(path), pose)
-        aside = torch.tensor([(number - (len(request.humans) - 1) / 2) * request.apart, 0.0, 0.0])
-        people.append(dataclasses.replace(placed, position=placed.position + aside))
-    return people

@@ -143,10 +143,6 @@ class MergeAnswer(Open):
     seconds: Seconds
     shape: list[Count] | None = None
 
-    def __str__(self) -> str:
-        """As the command line prints it."""
-        return str(self.out)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MergeFramesAnswer(Open):

@@ -443,27 +443,15 @@ class DrawRequest:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeRequest(PoseOptions):
-    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
+class MergeRequest:
+    """Merge humans into one voxel grid; the extension of `out` selects the format: .vdb or .npz."""
 
-    humans: Annotated[tuple[Path, ...], Option(positional=True)] = ()
-    """.human files (or .human.safetensors), side by side."""
-    people: Annotated[list[PosedPerson], Option(hidden=True)] = dataclasses.field(default_factory=list)
-    """Instead of `humans`."""
+    people: Annotated[list[PosedPerson], Length(1)]
+    """Humans posed by armatures."""
     out: Annotated[Path, Ending((".vdb", ".npz"))]
     """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
     voxel: Voxel = VOXEL
     """Voxel size, metres; half the size shows more detail at eight times the memory."""
-    apart: float = 1.0
-    """Distance between neighbours, side by side, metres."""
-
-    def check(self) -> None:
-        """Raise FieldError unless humans are given in exactly one way, and as `PoseOptions`."""
-        super().check()
-        if not self.humans and not self.people:
-            raise FieldError(("humans",), "is empty: give at least one")
-        if self.humans and self.people:
-            raise FieldError(("humans",), "and people exclude each other: give files, or humans posed by armatures")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
