@@ -9,7 +9,7 @@ import pytest
 NAMES = {
     "threads_person_error_max", "same_bytes_threads",
     "blend_properties_tried", "files_written_outside", "window_rounds", "window_crashes", "attack_cases",
-    "attack_cases_held", "two_writers_mixed",
+    "attack_cases_held",
 }  # fmt: skip
 
 
@@ -61,10 +61,8 @@ def test_without_a_window_its_figures_are_absent_or_kept(measure, window):
 
 
 def test_a_part_is_measured_anew_alone_and_says_when(measure, tmp_path):
-    (tmp_path / "faults.json").write_text(
-        json.dumps({"earlier_seconds": 3.0, "two_writers_mixed": 20, "commit": "old"})
-    )
-    assert measure(1, "--parts", "attacks")["two_writers_mixed"] == 20
+    (tmp_path / "faults.json").write_text(json.dumps({"earlier_seconds": 3.0, "window_crashes": 20, "commit": "old"}))
+    assert measure(1, "--parts", "attacks")["window_crashes"] == 20
     found = measure(2, "--parts", "threads", "blends")
     assert (found["attack_cases"], found["attacks_recorded"]) == (1, "stamp 1")
     assert (found["blend_properties_tried"], found["blends_recorded"]) == (2, "stamp 2")

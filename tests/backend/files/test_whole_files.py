@@ -21,7 +21,6 @@ from primdiffusion.files.whole_files import (
     written_whole,
 )
 from support.errors import refused
-from two_writers import mixed
 
 PATH = Path("x/figure.tar.gz")
 
@@ -46,10 +45,6 @@ def test_files_arrive_together_and_replace_older_ones(tmp_path):
             if text == "two":
                 assert (target / "a").read_text() == "one"
         assert contents(target) == {"a": text, "b": text}
-
-
-def test_files_of_two_processes_that_publish_at_once_are_not_mixed(tmp_path):
-    assert mixed(100, tmp_path) == 0
 
 
 def test_no_file_is_written_through_a_link_out_of_the_folder(tmp_path):
