@@ -75,10 +75,15 @@ def old_weights(folder: Path) -> Path:
 
 
 def smpl_npz(folder: Path) -> Path:
+    released_files.save_body(folder)  # with the texture coordinates
     arrays = released_files.body_arrays()
     arrays["J_regressor"] = arrays["J_regressor"].toarray()  # pyright: ignore[reportAttributeAccessIssue]
     np.savez(folder / "body.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return folder / "body.npz"
+
+
+def read_smpl(path: Path) -> object:
+    return load_body(path, path.with_name("smpl_uv.obj"))
 
 
 def depth(folder: Path) -> Path:
@@ -126,8 +131,8 @@ KINDS = {
     "checkpoint": Kind(lambda folder: save_tiny_checkpoint(folder / "model.safetensors"), load_checkpoint),
     "weights": Kind(weights, read_weights),
     "old weights": Kind(old_weights, read_weights),
-    "SMPL npz": Kind(smpl_npz, load_body),
-    "SMPL pkl": Kind(lambda folder: released_files.save_body(folder)[0], load_body),
+    "SMPL npz": Kind(smpl_npz, read_smpl),
+    "SMPL pkl": Kind(lambda folder: released_files.save_body(folder)[0], read_smpl),
     "pose": Kind(pose, read_pose),
     "BVH": Kind(bvh, read_motion),
     "AMASS": Kind(amass, read_motion),
