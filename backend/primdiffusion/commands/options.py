@@ -182,8 +182,6 @@ class ImportReleasedCommand:
     default is the mean body in the T pose, which differs by millimetres."""
     chain: Literal["released", "trailing"] = "released"
     """Timesteps of samplers: 991, 981, ... 1 as in the released code, or from the last step of the schedule."""
-    report: Path | None = None
-    """Output .json with a report on every tensor."""
 
 
 OPTIONS: dict[str, type] = {

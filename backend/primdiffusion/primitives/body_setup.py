@@ -88,13 +88,7 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     """
     folders, wanted = tuple(beside), (files.smpl, *files.uv)
     paths = [_found(file, folders) for file in wanted]
-    key = tuple((file.sha256, path.suffix) for file, path in zip(wanted, paths, strict=True))
-    body_setup = _loaded.pop(key, None)
-    if body_setup is None:
-        body_setup = body_setup_from_files(paths[0], tuple(paths[1:]))
-    _loaded[key] = body_setup
-    while len(_loaded) > _KEPT:
-        del _loaded[next(iter(_loaded))]
+    body_setup = _body_setup(tuple(paths), tuple(file.sha256 for file in wanted))
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
         raise ValueError(f"the stored rest extents are not {K} x 3 positive")
     return dataclasses.replace(
@@ -102,9 +96,10 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     )
 
 
-_KEPT = 2
-_loaded: dict[tuple[tuple[str, str], ...], BodySetup] = {}
-"""Bodies that were loaded, by the hashes and endings of their files, the last used last."""
+@functools.lru_cache(maxsize=2)
+def _body_setup(paths: tuple[Path, ...], hashes: tuple[str, ...]) -> BodySetup:
+    """Load the body of files with these hashes."""
+    return body_setup_from_files(paths[0], paths[1:])
 
 
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:

@@ -49,7 +49,7 @@ PROTOCOL = 1
 HEARTBEAT_S = 0.5
 LONGEST_LINE = LARGEST_BYTES + 2
 """Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
-OUTPUTS = ("out_dir", "out", "depth", "frame")
+OUTPUTS = ("out_dir", "out", "frame")
 """Fields of requests that are files and folders to write."""
 GRACE_S = 3.0
 """Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""

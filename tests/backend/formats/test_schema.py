@@ -184,7 +184,6 @@ GIVEN = {
 
 OTHERWISE = {
     "gaussians": {"out": "a.ply"},
-    "merge": {"out": "a.npz"},
     "reconstruct": {"capture": "a"},
     "fit_posture": {"pictures": ["a"]},
     "inpaint": {"region": ["top"]},
@@ -242,7 +241,7 @@ def test_a_regions_corner_is_counted_from_the_top():
         ("reconstruct", {"seed": 3}, "seed"),
         ("fit_posture", {"pictures": []}, "pictures"),
         ("merge", {"people": []}, "people"),
-        ("merge_frames", {"voxel": 0.0}, "voxel"),
+        ("merge", {"voxel": 0.0}, "voxel"),
         ("gaussians", {"object": STILL}, "object"),
     ],
 )

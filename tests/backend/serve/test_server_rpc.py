@@ -64,11 +64,11 @@ def test_lines_of_many_threads_do_not_mix_and_nan_is_not_sent():
     [
         ("generate", "out_dir", {"seed": 1}),
         ("variations", "out_dir", {"seeds": [1, 2]}),
-        ("render", "depth", {"human": "a.human", "out": "a.png"}),
+        ("render", "out", {"human": "a.human"}),
     ],
 )
 def test_nothing_is_written_to_a_server_or_a_path_of_control_characters(method, field, params, path):
-    ending = ".png" if field == "depth" else ""
+    ending = ".png" if field == "out" else ""
     with refused(RpcError, f"{method}.{field}") as caught:
         _parameters(RpcRequest(method, {**params, field: path + ending}, 1, True))
     assert str(caught.value).isprintable()
