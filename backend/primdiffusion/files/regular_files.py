@@ -17,7 +17,6 @@ _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(?=\.|$)", re.IGNORECASE)
 """Stems of names that are devices in every folder of Windows."""
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _LONGEST_PATH = 4096
 
 
@@ -112,11 +111,6 @@ def check_size(path: str | Path, size: int, limit: int) -> None:
 def is_plain_path(path: str) -> bool:
     """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
     return 0 < len(path) <= _LONGEST_PATH and path.isprintable() and not _REMOTE.match(path)
-
-
-def may_be_written(path: str) -> bool:
-    """Return whether a path of a request may be written to: no server, device, URL or control character."""
-    return not _REMOTE.match(path) and not _CONTROL.search(path)
 
 
 def is_local_path(path: str) -> bool:
