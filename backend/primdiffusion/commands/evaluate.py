@@ -34,7 +34,6 @@ from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_dep
 from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,
     Inception,
-    Resize,
     load_clip_vision,
     load_inception,
 )
@@ -155,8 +154,6 @@ class EvaluateGeneration:
     """Weights of FID's Inception-V3, pt_inception-2015-12-05-6726825d.pth or torch-fidelity's file."""
     clip: Path | None = None
     """Weights of CLIP's ViT-B/32, under OpenAI's names."""
-    resize: Resize = "torch-fidelity"
-    """Resizing of pictures for Inception and CLIP."""
     kid_subsets: Count = 100
     """Number of random subsets for KID."""
     kid_subset_size: Count = 1000
@@ -187,8 +184,8 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
         reals = mesh_images_of_seeds(open_assets(command.assets), seeds, poses, command.views)
     networks = Networks(
         load_pose_depth_network(),
-        None if command.inception is None else load_inception(command.inception, command.resize),
-        None if command.clip is None else load_clip_vision(command.clip, command.resize),
+        None if command.inception is None else load_inception(command.inception),
+        None if command.clip is None else load_clip_vision(command.clip),
     )
     model, fps, resolution = None, None, None
     if command.fake is None:
@@ -244,7 +241,7 @@ def _choices(command: EvaluateGeneration, fake: Scores, real: Scores) -> dict[st
         "real pictures": f"{real.pictures}: {command.real or f'{meshes_seeds} in {grid}'}",
         "poses": poses if rendered else "of the pictures",
         "marcher step (m)": MARCH.step if command.fake is None else None,
-        "resize": f"{command.resize}, to {Inception.SIDE} for Inception and {ClipVision.SIDE} for CLIP",
+        "resize": f"as torch-fidelity, to {Inception.SIDE} for Inception and {ClipVision.SIDE} for CLIP",
         "inception": f"pool3, 2048 features, {command.inception}" if command.inception else None,
         "clip": f"image embedding of ViT-B/32, 512 features, {command.clip}" if command.clip else None,
         "KID": f"{command.kid_subsets} subsets of {command.kid_subset_size}, seed {KID_SEED}, cubic kernel",
