@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 from scipy import ndimage
 
 from primdiffusion.capture.reader import Window, resample
@@ -39,7 +39,7 @@ MARGIN = 0.08
 LONG_SIDE_DEGREES = 45.0
 """Field of view along the longer side where a picture does not state its lens: a lens of 43 mm on 35 mm film."""
 FILM_MM = 36.0
-_ORIENTATION, _EXIF, _FOCAL_35_MM = ExifTags.Base.Orientation, ExifTags.IFD.Exif, ExifTags.Base.FocalLengthIn35mmFilm
+_EXIF, _FOCAL_35_MM = ExifTags.IFD.Exif, ExifTags.Base.FocalLengthIn35mmFilm
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def _figure(
     """A person before it is scaled."""
     with _picture(path) as picture:
         focal, bands = _focal_length(picture), picture.getbands()
-        pixels = _upright(decoded(picture, "RGBA"), picture)
+        pixels = decoded(ImageOps.exif_transpose(picture), "RGBA")
     uncut = mask_path is None and outline is not None and pixels[..., 3].min() == 255
     if uncut and outline is not None:
         mask = outline(pixels.shape[1], pixels.shape[0])
@@ -141,7 +141,7 @@ def _figure(
             raise FileError(path, "is opaque everywhere", "cut the person out, or give a mask file for it")
     else:
         with _picture(mask_path) as picture:
-            mask = _upright(_coverage(picture, mask_label), picture)
+            mask = _coverage(ImageOps.exif_transpose(picture), mask_label)
         if mask.shape != pixels.shape[:2]:
             size = f"{mask.shape[1]} x {mask.shape[0]} pixels"
             raise FileError(
@@ -179,21 +179,6 @@ def _focal_length(picture: Image.Image) -> float | None:
     except (TypeError, ValueError, ArithmeticError, LookupError, SyntaxError):
         return None
     return stated / FILM_MM if 5 <= stated <= 1000 else None
-
-
-def _upright(pixels: np.ndarray, picture: Image.Image) -> np.ndarray:
-    """Turn and mirror as EXIF says; a view."""
-    try:
-        orientation = int(picture.getexif().get(_ORIENTATION) or 1)
-    except (TypeError, ValueError, SyntaxError):
-        orientation = 1
-    if orientation in (5, 6, 7, 8):
-        pixels = pixels.swapaxes(0, 1)
-    if orientation in (3, 4, 7, 8):
-        pixels = pixels[::-1]
-    if orientation in (2, 3, 6, 7):
-        pixels = pixels[:, ::-1]
-    return pixels
 
 
 def _coverage(picture: Image.Image, label: int | None) -> UInt8[np.ndarray, "H W"]:
