@@ -79,18 +79,7 @@ def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO
     """
     size = check_regular(path).st_size  # before it is opened: to open a device may already do something
     check_size(path, size, limit)
-    if not size:
-        return io.BytesIO()
-    file = open(path, "rb")  # noqa: SIM115  the caller closes it
-    try:
-        opened = os.fstat(file.fileno())  # another file may have taken its name in between
-        if not stat.S_ISREG(opened.st_mode):
-            raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
-        check_size(path, opened.st_size, limit)
-    except BaseException:
-        file.close()
-        raise
-    return file
+    return open(path, "rb") if size else io.BytesIO()
 
 
 def read_regular(path: str | Path, limit: int) -> bytes:
