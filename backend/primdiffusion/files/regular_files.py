@@ -97,11 +97,6 @@ def check_size(path: str | Path, size: int, limit: int) -> None:
         raise FileError(path, f"is larger than {limit / 2**20:.0f} MB, the most for its kind", "use a smaller file")
 
 
-def is_plain_path(path: str) -> bool:
-    """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
-    return 0 < len(path) <= _LONGEST_PATH and path.isprintable() and not _REMOTE.match(path)
-
-
 def is_local_path(path: str) -> bool:
     """Return whether a path is absolute and of this computer: no server, device or URL. Folders may have any name."""
     return 0 < len(path) <= _LONGEST_PATH and "\0" not in path and not _REMOTE.match(path) and os.path.isabs(path)

@@ -18,7 +18,7 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel
 from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.regular_files import FileError, check_regular, is_plain_path, open_regular, real_path
+from primdiffusion.files.regular_files import FileError, check_regular, is_local_path, open_regular, real_path
 from primdiffusion.formats.schema import read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
@@ -104,9 +104,9 @@ def _body_setup(paths: tuple[Path, ...], hashes: tuple[str, ...]) -> BodySetup:
 
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
     shown, name = f"{file.path!r:.120}".strip("'"), PureWindowsPath(file.path).name  # also parses POSIX paths
-    named = [Path(file.path)] if is_plain_path(file.path) else []
+    named = [Path(file.path)] if is_local_path(file.path) else []
     problem = "is missing" if named else "is not named by a path on this machine"
-    for path in (*named, *(folder / name for folder in folders if name and is_plain_path(name))):
+    for path in (*named, *(folder / name for folder in folders if name)):
         try:
             status = check_regular(path)
             digest = _known_sha256(path, status.st_mtime_ns, status.st_size)
