@@ -53,7 +53,6 @@ ATTACKS = (
     "tests/backend/files/test_whole_files.py::test_no_file_is_written_through_a_link_out_of_the_folder",
     "tests/backend/released/test_inventory.py::"
     "test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file",
-    "tests/backend/serve/test_server_rpc.py::test_nothing_is_written_to_a_server_or_a_path_of_control_characters",
     "tests/backend/runtime/test_failures.py::test_no_terminal_escape_of_a_file_is_in_a_sentence",
     "tests/backend/runtime/test_failures.py::test_the_command_line_prints_no_escape",
     "tests/backend/files/test_folder_lock.py::test_a_link_in_place_of_the_lock_is_named_and_its_target_stays",
