@@ -4,7 +4,6 @@
     python benchmarks/everywhere.py --parts coco --size 128 --frames 2 --cameras 3    # a quick try of one part
 
 - types: errors that pyright finds when it checks as on Windows and on macOS.
-- windows: tests that run under Windows' rules on Linux (`tests/support/windows_rules.py`), and how many of them fail.
 - wheel: its size, and the median time of a new process that imports `generate` and `march`, and so torch, from the
   unpacked wheel alone.
 - coco: bodies that stand together are rendered and annotated. pycocotools decodes the masks, and embree casts a ray
@@ -30,7 +29,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,7 +55,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "backend")]
 from capture_scenes import body_mesh, save_person  # noqa: E402
 from support import hopper  # noqa: E402
 from support.wheel import build_archives  # noqa: E402
-from support.windows_run import UNDER_THE_RULES, run_under_the_rules  # noqa: E402
 
 from build_addon import build  # noqa: E402
 
@@ -75,7 +72,6 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="width and height of the captures, pixels")
     parser.add_argument("--frames", type=int, default=4, help="poses in the captures")
     parser.add_argument("--cameras", type=int, default=6, help="views of each pose")
-    parser.add_argument("--tests", nargs="+", default=UNDER_THE_RULES, help="tests to run under Windows' rules")
     arguments = parser.parse_args()
     figures: Figures = {}
     for name in arguments.parts or PARTS:
@@ -92,21 +88,6 @@ def types(_: argparse.Namespace, __: Path) -> Figures:
         done = subprocess.run([*command, "--outputjson"], cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
         figures[f"pyright_errors_{system.lower()}"] = json.loads(done.stdout)["summary"]["errorCount"]
     return figures
-
-
-def windows(given: argparse.Namespace, folder: Path) -> Figures:
-    if sys.platform != "linux":  # the rules look into /proc
-        return {"tests_under_windows_rules": None, "tests_failing_under_windows_rules": None}
-    done = run_under_the_rules("--junitxml", str(folder / "tests.xml"), tests=tuple(given.tests))
-    if done.returncode not in (0, 1):
-        raise SystemExit(f"pytest ended with exit code {done.returncode}: {done.stdout[-1000:]}")
-    counts = {name: 0 for name in ("tests", "skipped", "failures", "errors")}
-    for suite in ET.parse(folder / "tests.xml").iter("testsuite"):
-        counts = {name: count + int(suite.get(name, 0)) for name, count in counts.items()}
-    return {
-        "tests_under_windows_rules": counts["tests"] - counts["skipped"],
-        "tests_failing_under_windows_rules": counts["failures"] + counts["errors"],
-    }
 
 
 def wheel(_: argparse.Namespace, folder: Path) -> Figures:
@@ -234,7 +215,6 @@ def launches() -> Iterator[hopper.Launch]:
 
 PARTS: dict[str, Callable[[argparse.Namespace, Path], Figures]] = {
     "types": types,
-    "windows": windows,
     "wheel": wheel,
     "coco": coco,
     "viewer": viewer,

@@ -12,8 +12,7 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
 - blends: a stranger's names and paths in a .blend: how many properties were tried, and how many files they changed
   outside of the folder beside it (`tests/blender/blend_tampering.py`)
 - attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
-  tests in ATTACKS: how many there are, and how many did no harm; writers: how many of 200 results of two processes that
-  write into one folder at once are mixed (`tests/backend/two_writers.py`)
+  tests in ATTACKS: how many there are, and how many did no harm
 - rigs: motions and scans of the default body as a Mixamo, Ready Player Me, Rokoko, VRoid and SOMA rig: how many are
   read and stand, and the largest error of a scan's size as a fraction (`tests/blender/real_rigs.py`)
 - window: rounds of undo and redo among timers in a real window, and crashes, from the figures of
@@ -54,7 +53,6 @@ ATTACKS = (
     "tests/backend/files/test_whole_files.py::test_no_file_is_written_through_a_link_out_of_the_folder",
     "tests/backend/released/test_inventory.py::"
     "test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file",
-    "tests/backend/serve/test_server_rpc.py::test_nothing_is_written_to_a_server_or_a_path_of_control_characters",
     "tests/backend/runtime/test_failures.py::test_no_terminal_escape_of_a_file_is_in_a_sentence",
     "tests/backend/runtime/test_failures.py::test_the_command_line_prints_no_escape",
     "tests/backend/files/test_folder_lock.py::test_a_link_in_place_of_the_lock_is_named_and_its_target_stays",
@@ -206,7 +204,6 @@ PARTS: dict[str, Part] = {
         lambda _: tool("tests/blender/blend_tampering.py", is_shown=False),
     ),
     "attacks": Part(("attack_cases", "attack_cases_held"), lambda _: attacks()),
-    "writers": Part(("two_writers_mixed",), lambda _: tool("tests/backend/two_writers.py", "--rounds", "200")),
     "rigs": Part(
         ("real_rigs", "real_rigs_read", "real_rigs_upright", "capture_scale_error_max"),
         lambda _: tool("tests/blender/real_rigs.py", is_shown=False),

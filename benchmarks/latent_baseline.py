@@ -59,7 +59,7 @@ class DecoderObjective:
         coefficients, rest = self.denoiser.prior.split(z)
         std = self.denoiser.prior.rest_variance.sqrt()
         error = decoded_rest(self.denoiser, coefficients) - rest / std
-        return weighted_error(error.flatten(1), std.flatten().expand(len(z), -1), self.config.error_power)
+        return weighted_error(error, std.expand(len(z), *std.shape))
 
 
 def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEPS) -> list[Human]:

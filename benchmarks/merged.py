@@ -170,9 +170,9 @@ def main() -> None:
     posed = PosedPerson(folder / "person.human.safetensors", raised.tolist(), joints[:, :3].tolist())
     session = Session()
     began = time.perf_counter()
-    commands.merge(MergeRequest(people=[posed], out=folder / "grid.npz"), session, lambda *_, **__: None)
+    commands.merge(MergeRequest(people=[posed], out_dir=folder), session, lambda *_, **__: None)
     figures["seconds_merge"] = time.perf_counter() - began
-    grid = merging.read_grid(folder / "grid.npz")
+    grid = merging.read_grid(folder / "0000.npz")
     began = time.perf_counter()
     digest = merging.write_grid(grid, folder / "grid.vdb")
     files = merging.publish([folder / "grid.vdb"], [digest], merging.merged_folder(person))

@@ -81,7 +81,6 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("FID, largest difference to another implementation", "faithful", "fid_equal_error", ""),
         ("hostile files and settings that were held", "faults", "attack_cases_held", ""),
         ("of", "faults", "attack_cases", ""),
-        ("tests under Windows' file rules that fail", "everywhere", "tests_failing_under_windows_rules", ""),
     ),
 }
 """Per table: what was measured, the record, its key, and the unit."""

@@ -3,7 +3,7 @@
 `python benchmarks/tables.py --models DIR --assets DIR --json docs/results/tables.json --table
 docs/results/tables_table.md` samples DIR/ours/model.safetensors and DIR/latents/model.safetensors of
 train_baselines.py and DIR/voxels/voxel.safetensors, and judges --count humans of each by the
-code of `primdiffusion evaluate generation --table 2`: 512 x 512 pictures over white from --views sides beside renders
+code of `primdiffusion evaluate generation`: 512 x 512 pictures over white from --views sides beside renders
 of twice as many meshes of seeds that no model trains on. All are in the rest pose, since voxels have no other.
 Distances, PCKh and depth errors are of our own network; `_real` are of the renders, `_floor` of its card. `_default` is
 the default model, which had more people and time.
@@ -74,7 +74,7 @@ def main() -> None:
         "pictures": f"{arguments.count} humans from {arguments.views} sides in the rest pose; "
         f"{REAL_EACH * arguments.count} meshes"
     }
-    text = table(2, rows, choices)
+    text = table(rows, choices)
     print(text)
     if arguments.table is not None:
         arguments.table.write_text(text + "\n", encoding="utf-8")
@@ -152,7 +152,7 @@ def judged_rows(
     own: dict[str, Cell] = {}
     for name, model in models.items():
         fake = judged(name, lambda seeds, m=model: m.images(seeds, views), seeds_of(count), networks, found)
-        cells = compare_pictures(fake, real, 100, 1000, 2020)
+        cells = compare_pictures(fake, real)
         rows[name], own = cells["generated"], cells["real"]
     return {**rows, "real": own, "floor": reference_cells(networks.own.card)}
 

@@ -115,7 +115,7 @@ def training_figures() -> dict[str, float]:
 
     def passes(rest: Tensor, coefficients: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         guess, std, correction = denoiser.rest_parts(rest, coefficients, t)
-        loss = weighted_error(((guess - rest) / std + correction).flatten(1), std.flatten(1), 1.0)
+        loss = weighted_error((guess - rest) / std + correction, std)
         return loss.detach(), *torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
 
     figures["cuda_train_network_ms"] = median_ms(lambda: passes(*inputs))

@@ -1,6 +1,6 @@
-"""List the licences of the asset files from which a folder of `primdiffusion people` was made.
+"""List the licences of the asset files from which `primdiffusion people` makes humans.
 
-    python -m scripts.asset_licences PEOPLE --assets DIR
+    python -m scripts.asset_licences --assets DIR
 
 Text files (.mhclo, .obj, .mhmat) begin with comments that state their licence. Images are listed in a LICENSES.txt in
 or above the folder (a table `path | ... | licence | ...`), or referenced by a material in the same folder that states
@@ -14,10 +14,8 @@ import re
 from pathlib import Path
 
 import tyro
-from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import open_regular, read_regular
-from primdiffusion.people.assets import open_assets
-from primdiffusion.people.folder import MANIFEST
+from primdiffusion.people.assets import SUBFOLDERS, open_assets
 
 UNKNOWN = "unknown"
 LIST = "LICENSES.txt"
@@ -105,11 +103,13 @@ def _head(file: Path) -> str:
         return ""
 
 
-def main(people: tyro.conf.Positional[Path], assets: Path | None = None) -> None:
-    """Print a line for each asset: its licence, and its path in the asset folder."""
+def main(assets: Path | None = None) -> None:
+    """Print a line for each mesh, proxy and image: its licence, and its path in the asset folder."""
     root = open_assets(assets).root
-    for asset in read_json(people / MANIFEST)["assets"]:
-        print(f"{licence_of(root, asset['path']):<12} {asset['path']}")
+    for path in sorted(path for folder in SUBFOLDERS for path in (root / folder).rglob("*.*")):
+        if path.suffix in (".mhclo", ".obj", ".png", ".jpg"):
+            name = path.relative_to(root).as_posix()
+            print(f"{licence_of(root, name):<12} {name}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Train the network of joints, depth and attributes that `primdiffusion evaluate generation --table` judges with.
+"""Train the network of joints, depth and attributes that `primdiffusion evaluate generation` judges with.
 
     python -m scripts.train_pose_depth_network --assets DIR --out backend/primdiffusion/weights/pose_depth.safetensors
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from primdiffusion.body.model import BodyModel
-from primdiffusion.capture.people_files import SUBJECT_NAME, find_people, read_person
+from primdiffusion.capture.people_files import SUBJECT_NAME, read_person
 from primdiffusion.capture.reader import as_camera
 from primdiffusion.capture.render import Renderable
 from primdiffusion.formats.camera_rig import View
@@ -24,8 +24,10 @@ from primdiffusion.raster.rasterise import Draw, check_samples
 from primdiffusion.render.march import march
 
 ENDINGS = (".human.safetensors", ".human")
-PERSON_FILE = "person.human.safetensors"
-"""Name of the file in a folder of its own, as Blender stores humans."""
+OWN_FOLDER = ("person.human.safetensors", "person.glb")
+"""Names of files in folders of their own: Blender's generated humans, and those of `primdiffusion people`."""
+PATTERNS = (*(f"*{ending}" for ending in ENDINGS), *(f"*/{name}" for name in OWN_FOLDER))
+"""Where humans are in a folder."""
 PASSES = ("img", "mask", "depth")
 """Passes that volumes have."""
 VISIBLE = 0.03
@@ -124,25 +126,18 @@ def find_subjects(path: str | Path) -> dict[str, Path]:
         if is_generated(path) and SUBJECT_NAME.fullmatch(name):
             return {name: path}
         raise ValueError(f"{path} is no human to capture: choose a folder, or NAME.human of letters, digits and . _ -")
-    generated: dict[str, Path] = {}
-    for found in sorted([*path.glob("*.human"), *path.glob("*.human.safetensors"), *path.glob(f"*/{PERSON_FILE}")]):
-        name = _name(found)
-        if not SUBJECT_NAME.fullmatch(name):
-            continue
-        if name in generated:
-            raise ValueError(f"{generated[name]} and {found} are two humans of one name: rename one")
-        generated[name] = found
-    try:
-        people = find_people(path)
-    except FileNotFoundError:
-        if not generated:
-            raise FileNotFoundError(
-                f"{path} contains no NAME/person.glb and no NAME.human: make some with primdiffusion people or generate"
-            ) from None
-        people = {}
-    if twice := sorted(people.keys() & generated.keys()):
-        raise ValueError(f"{people[twice[0]]} and {generated[twice[0]]} are two humans of one name: rename one")
-    return dict(sorted({**people, **generated}.items()))
+    found: dict[str, Path] = {}
+    for file in sorted(file for pattern in PATTERNS for file in path.glob(pattern)):
+        name = _name(file)
+        if name in found:
+            raise ValueError(f"{found[name]} and {file} are two humans of one name: rename one")
+        if SUBJECT_NAME.fullmatch(name):
+            found[name] = file
+    if not found:
+        raise FileNotFoundError(
+            f"{path} contains no NAME/person.glb and no NAME.human: make some with primdiffusion people or generate"
+        )
+    return dict(sorted(found.items()))
 
 
 def is_generated(path: Path) -> bool:
@@ -162,7 +157,7 @@ def read_subject(path: Path) -> Renderable:
 
 
 def _name(path: Path) -> str:
-    if path.name == PERSON_FILE:
+    if path.name in OWN_FOLDER:
         return path.parent.name
     ending = next((ending for ending in ENDINGS if path.name.endswith(ending)), "")
     return path.name.removesuffix(ending)

@@ -58,7 +58,8 @@ def choose_poses(settings: CaptureSettings, report: Report) -> Motion:
     for path in settings.pose_files:
         try:
             motions.append(read_motion(path))
-            report.notes += [f"{path.name}: {note}" for note in motions[-1].notes]
+            if doubt := motions[-1].detected.doubt:
+                report.notes.append(f"{path.name}: {doubt}")
         except FileError as error:
             report.fail("", "poses", str(error))
     if not motions:

@@ -16,7 +16,7 @@ from bpy.app.handlers import persistent
 from ..engine.engine import ENGINE
 from ..engine.picture import pose_of
 from ..files.regular_files import printable, remove_file
-from ..formats.answers import MergeFramesAnswer
+from ..formats.answers import MergeAnswer
 from ..scene.armature import check_joints
 from ..scene.human import HumanTarget, all_humans, session_file
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
@@ -160,7 +160,7 @@ class PoseSnapshot:
 class MergeJob(Job):
     """Merge a human into one volume, or one for each frame."""
 
-    method = "merge_frames"
+    method = "merge"
     undo = "Merge Human"
 
     target: HumanTarget
@@ -202,7 +202,7 @@ class MergeJob(Job):
             self._error = error
         return _grid(folder, len(self._digests)).is_file()
 
-    def finish(self, _context: bpy.types.Context, result: MergeFramesAnswer, folder: Path) -> str:
+    def finish(self, _context: bpy.types.Context, result: MergeAnswer, folder: Path) -> str:
         person = self.target.found()
         while self.advance(folder):
             pass

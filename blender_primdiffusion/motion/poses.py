@@ -81,8 +81,7 @@ def pick_poses(motions: Sequence[Motion], count: int, seed: int = 0) -> Motion:
         distance = np.minimum(distance, _distance(places, places[picked[-1]]))
     poses = rotations[picked]
     names = ", ".join(dict.fromkeys(motion.name for motion in motions))
-    notes = () if has_t else ("no frame is near a T pose: the first is built in",)
-    return Motion(poses, grounding(poses), 1.0, names, notes)
+    return Motion(poses, grounding(poses), 1.0, names)
 
 
 def _about_pelvis(rotations: NDArray) -> NDArray[np.float64]:

@@ -40,7 +40,7 @@ def settings(people: Path, run: Path, **changes) -> TrainingConfig:
         "person": PhaseConfig(steps=6, batch=16, evaluate_every=6),
         "local": PhaseConfig(steps=4, batch=4, evaluate_every=4),
         "unet": TINY_UNET,
-        "slab": PhaseConfig(steps=2, batch=1, learning_rate=1e-3, weighting="plain", evaluate_every=2),
+        "slab": PhaseConfig(steps=2, batch=1, learning_rate=1e-3, evaluate_every=2),
         "log_every": 1,
         "threads": 1,
     }

@@ -218,7 +218,7 @@ def template() -> Tensor:
 
 def save_capture(root: Path, name: str = "someone", size: int = 48, cameras: int = 4) -> Path:
     """A dataset of the drum in the released layout, grey by its normals, in two frames; returns its subject."""
-    body, folder = load_body(root / "SMPL_NEUTRAL.pkl"), root / "captures" / name
+    body, folder = load_body(root / "SMPL_NEUTRAL.pkl", root / "smpl_uv.obj"), root / "captures" / name
     (folder / "outputs_re_fitting").mkdir(parents=True)
     (folder.parent / "release_human_list.txt").write_text(f"{name}\n")
     corners = body.template[body.faces].double().numpy()

@@ -190,14 +190,14 @@ def test_interrupted_captures_go_on_to_the_same_bytes_and_two_workers_write_them
 
 
 def test_a_generated_human_stands_beside_a_mesh(tmp_path):
-    save_person(tmp_path / "people" / "box.glb")
+    save_person(tmp_path / "people" / "box" / "person.glb")
     save(tmp_path / "people" / "ada" / "person.human.safetensors")
     cli.main(words(tmp_path, "--together", "2"))
     captures = open_captures(tmp_path / "captures")
     ada, box = captures.subject("ada"), captures.subject("box")
     for view, same in zip(ada.views, box.views, strict=True):
         assert np.array_equal(view.translation, same.translation)
-    people = [read_subject(tmp_path / "people" / name) for name in ("ada/person.human.safetensors", "box.glb")]
+    people = [read_subject(tmp_path / "people" / name) for name in ("ada/person.human.safetensors", "box/person.glb")]
     setup = set_up_together(people, 0, poses(), Rig(count=CAMERAS, width=SIZE, height=SIZE), np.random.default_rng(1))
     for matrices in setup.skinning:
         assert setup.person.points(matrices)[:, 1].min() == pytest.approx(0, abs=1e-4)
@@ -248,16 +248,16 @@ def test_a_damaged_human_fails_alone(tmp_path, fails):
 def test_humans_are_found_by_their_names(tmp_path):
     for name in ("a.human", "b.human.safetensors", "c/person.human.safetensors", "d e.human"):
         save(tmp_path / name)
-    save_person(tmp_path / "f.glb")
+    save_person(tmp_path / "f" / "person.glb")
     assert list(find_subjects(tmp_path)) == ["a", "b", "c", "f"]
     assert find_subjects(tmp_path / "a.human") == {"a": tmp_path / "a.human"}
-    assert renderer_of([tmp_path / "f.glb"]) == "rasteriser"
+    assert renderer_of([tmp_path / "f" / "person.glb"]) == "rasteriser"
     assert renderer_of([tmp_path / "a.human"]) == "marcher"
-    for one in ("d e.human", "f.glb"):
+    for one in ("d e.human", "f/person.glb"):
         with refused(ValueError, one):
             find_subjects(tmp_path / one)
     with refused(FileNotFoundError, "nowhere"):
         find_subjects(tmp_path / "nowhere")
-    save_person(tmp_path / "a.glb")
-    with refused(ValueError, "a.glb"):
+    save_person(tmp_path / "a" / "person.glb")
+    with refused(ValueError, "a.human"):
         find_subjects(tmp_path)

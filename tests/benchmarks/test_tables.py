@@ -7,19 +7,13 @@ import importlib.util
 import everywhere
 import numpy as np
 import pytest
-import tables
-import torch
-from diffuse_runs import settings
-from diffusion_people import small_model, write_people
+from diffusion_people import small_model
 from latent_baseline import decoded_rest, sample_people
 from primdiffusion.capture.coco import KEYPOINTS
-from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.tables import Cell, Networks, Scores
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
 from support.errors import refused
-from tables import Model, check_equal, figures_of, judged
-from train_baselines import train_model
+from tables import check_equal
 
 CARD = {"minutes": 3.0, "people": 10, "geometries": 5, "steps": {"local": 7}}
 
@@ -42,75 +36,12 @@ def test_everything_of_a_human_follows_from_its_vector(baseline):
     assert float((decoded.density[0] - human.payload.density)[inside].abs().mean()) < 40
 
 
-def test_latent_samples_follow_from_their_seeds(baseline):
-    first, second = sample_people(baseline, [1, 2], steps=2)
-    (again,) = sample_people(baseline, [2], steps=2)
-    assert torch.allclose(again.payload.rgb, second.payload.rgb, atol=1e-4)
-    assert torch.allclose(again.betas, second.betas, atol=1e-4)
-    assert not torch.allclose(first.payload.rgb, second.payload.rgb, atol=1e-2)
-
-
-def test_another_model_is_no_latent_baseline():
-    with refused(ValueError, "baseline"):
-        sample_people(small_model(), [0])
-
-
-@pytest.mark.parametrize("kind", ["ours", "latents"])
-def test_models_are_trained_for_their_time_and_go_on(tmp_path, kind):
-    write_people(tmp_path / "people", 10)
-    config = settings(tmp_path / "people", tmp_path / "prepared")
-    config.run.mkdir()
-    out = tmp_path / "out"
-    out.mkdir()
-    train_model(config, kind, out, minutes=0.01, threads=1)
-    model = load_checkpoint(out / "model.safetensors")
-    assert model.card["baseline"] == kind
-    assert model.card["people"] == 16
-    assert set(model.card["steps"]) == {"person", "local"}
-    written = (out / "local.state.safetensors").stat().st_mtime
-    train_model(config, kind, out, minutes=0.01, threads=1)
-    again = load_checkpoint(out / "model.safetensors")
-    assert again.card["steps"] == model.card["steps"]
-    assert written <= (out / "local.state.safetensors").stat().st_mtime
-
-
 def test_unequal_models_are_not_compared():
     check_equal({"ours": CARD, "latents": {**CARD, "minutes": 3.1}})
     with refused(ValueError, "trained"):
         check_equal({"ours": CARD, "latents": {**CARD, "minutes": 4.0}})
     with refused(ValueError, "trained"):
         check_equal({"ours": CARD, "latents": {**CARD, "people": 11}})
-
-
-def test_figures_name_model_and_measure():
-    def images(seeds, views):
-        return iter(())
-
-    rows = {"ours": {"own_distance": Cell(1.2345)}, "floor": {"own_pckh": Cell(30.0), "own_depth": Cell(90.0)}}
-    figures = figures_of(rows, dict.fromkeys(("ours", "latents", "voxels"), Model(CARD, images)))
-    assert figures["distance_ours"] == 1.234
-    assert figures["pckh_floor"] == 30.0
-    assert figures["depth_error_latents"] is None
-    assert figures["steps_local_voxels"] == 7
-    assert "distance_floor" not in figures
-
-
-def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
-    asked = []
-
-    def evaluate(images, networks):
-        seeds = list(images)
-        asked.extend(seeds)
-        features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
-        return Scores(len(seeds), features, [0.5] * len(seeds), [])
-
-    monkeypatch.setattr(tables, "look_at_pictures", evaluate)
-    first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
-    again = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
-    assert asked == list(range(10))
-    assert torch.equal(first.features["own"], again.features["own"])
-    assert again.features["own"][:, 0].tolist() == asked
-    assert len(again.correct) == again.pictures == 10
 
 
 def front() -> View:
@@ -159,9 +90,3 @@ def test_a_keypoint_that_is_off_by_two_pixels_is_noticed_unless_it_is_unknown():
     assert everywhere.keypoint_error(keypoints.ravel().tolist(), view, joints) == pytest.approx(2)
     keypoints[KEYPOINTS.index("left_knee"), 2] = 0
     assert everywhere.keypoint_error(keypoints.ravel().tolist(), view, joints) < 1e-9
-
-
-def test_overlap_is_the_intersection_over_the_union():
-    one, other = np.array([True, True, False, False]), np.array([True, False, True, False])
-    assert everywhere.overlap(one, other) == pytest.approx(1 / 3)
-    assert everywhere.overlap(one, one) == 1

@@ -1,25 +1,15 @@
 """People as grids of voxels, and the baseline that diffuses them."""
 
-import argparse
-
-import encoder_paper_form
-import fit_scenes
 import numpy as np
 import pytest
 import torch
-from capture_scenes import captured
-from encoder_paper_form import figures_of, measured, train
-from primdiffusion.capture.reader import open_captures
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
-from primdiffusion.encoder.config import PRESETS
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
-from tiny_encoder import TINY
 from voxel_baseline import (
-    BLOCKS,
     BOUNDS,
     SIDE,
     VoxelCodec,
@@ -107,13 +97,6 @@ def codec() -> VoxelCodec:
     return fit_voxel_codec(lambda: people(6), 16)
 
 
-def test_codec_keeps_occupied_cells_and_their_mirror_images(codec):
-    assert torch.equal(codec.mirrored[codec.mirrored], torch.arange(len(codec.cells)))
-    z, x = codec.cells // BLOCKS**2, codec.cells % BLOCKS
-    assert (int(z.min()), int(z.max())) == (5, 9)
-    assert int(x.min()) + int(x.max()) == BLOCKS - 1
-
-
 def test_codec_gives_back_what_lies_in_its_basis(codec):
     grid = people(6)[2]
     decoded = codec.decode(codec.encode(grid))
@@ -122,12 +105,6 @@ def test_codec_gives_back_what_lies_in_its_basis(codec):
     assert float((decoded[..., :3] - wanted)[solid].abs().mean()) < 0.02
     assert float((decoded[..., 3] * solid).sum() / solid.sum()) > 0.2
     assert torch.allclose(codec.basis @ codec.basis.T, torch.eye(16), atol=1e-5)
-
-
-def test_mirror_of_latents_is_the_mirror_of_grids(codec):
-    grid = people(6)[1]
-    grid[..., 26:28, :3] = 30
-    assert torch.allclose(codec.mirror(codec.encode(grid)), codec.encode(grid.flip(-2)), atol=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -162,42 +139,9 @@ def test_untrained_network_leaves_the_closed_form_and_trained_does_not(model):
     assert not torch.allclose(changed, model.denoiser.prior.denoise(x, signal, noise), atol=1e-2)
 
 
-def test_samples_follow_from_their_seeds(model):
-    first, second = model.sample([3, 4], steps=3)
-    again = next(model.sample([4], steps=3))
-    assert torch.equal(again.grid, second.grid)
-    assert torch.equal(again.betas, second.betas)
-    assert not torch.equal(first.grid, second.grid)
-    assert first.grid.shape == (SIDE, SIDE, SIDE, 4)
-    assert 0 <= float(first.grid.min()) <= float(first.grid.max()) <= 1
-
-
 def test_baseline_is_stored_whole(model, tmp_path):
     save_voxel_model(tmp_path / "voxel.safetensors", model)
     again = load_voxel_model(tmp_path / "voxel.safetensors")
     assert again.card == model.card
     assert torch.equal(next(again.sample([1], steps=2)).grid, next(model.sample([1], steps=2)).grid)
     assert torch.equal(again.shapes.scale, model.shapes.scale)
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
-
-
-def test_a_form_is_trained_and_compared(captures, tmp_path, monkeypatch):
-    monkeypatch.setitem(PRESETS, "paper", TINY)
-    few = {**fit_scenes.FEW, "threads": 1}
-
-    def settings(arguments, ablation, count):
-        return fit_scenes.settings(captures, tmp_path / "run", **{**few, "steps": count, "encoder": "paper"})
-
-    monkeypatch.setattr(encoder_paper_form, "settings", settings)
-    fit_scenes.forget_processes()
-    arguments = argparse.Namespace(minutes=0.001, given=1, cameras=1, compared_size=16)
-    path = tmp_path / "full.safetensors"
-    train(arguments, None, open_captures(captures), path)
-    figures = figures_of("full", path, measured(path, open_captures(captures), arguments))
-    assert figures["steps_full"] >= 1
-    assert 0 < figures["psnr_full"] < 60
-    assert figures["pictures_full"] >= 1

@@ -75,10 +75,15 @@ def old_weights(folder: Path) -> Path:
 
 
 def smpl_npz(folder: Path) -> Path:
+    released_files.save_body(folder)  # with the texture coordinates
     arrays = released_files.body_arrays()
     arrays["J_regressor"] = arrays["J_regressor"].toarray()  # pyright: ignore[reportAttributeAccessIssue]
     np.savez(folder / "body.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return folder / "body.npz"
+
+
+def read_smpl(path: Path) -> object:
+    return load_body(path, path.with_name("smpl_uv.obj"))
 
 
 def depth(folder: Path) -> Path:
@@ -126,8 +131,8 @@ KINDS = {
     "checkpoint": Kind(lambda folder: save_tiny_checkpoint(folder / "model.safetensors"), load_checkpoint),
     "weights": Kind(weights, read_weights),
     "old weights": Kind(old_weights, read_weights),
-    "SMPL npz": Kind(smpl_npz, load_body),
-    "SMPL pkl": Kind(lambda folder: released_files.save_body(folder)[0], load_body),
+    "SMPL npz": Kind(smpl_npz, read_smpl),
+    "SMPL pkl": Kind(lambda folder: released_files.save_body(folder)[0], read_smpl),
     "pose": Kind(pose, read_pose),
     "BVH": Kind(bvh, read_motion),
     "AMASS": Kind(amass, read_motion),
@@ -240,9 +245,6 @@ CLAIMS: dict[tuple[str, str], Callable[[Path], object]] = {
     ("SMPL npz", "NaN"): lambda path: with_array(path, "v_template", nan),
     ("SMPL npz", "wrong shape"): lambda path: with_array(path, "weights", lambda values: values[:, :5]),
     ("SMPL npz", "hostile member"): lambda path: with_member(path, "v_template.npy", objects()),
-    ("SMPL pkl", "huge size"): lambda path: path.write_bytes(b"\x80\x05\x96" + struct.pack("<Q", 2**36) + b"."),
-    ("SMPL pkl", "huge memo"): lambda path: path.write_bytes(b"\x80\x02]r\xff\xff\xff\x7f."),
-    ("SMPL pkl", "deep key"): lambda path: path.write_bytes(b"\x80\x02})" + b"\x85" * 200_000 + b"K\x01s."),
     ("pose", "wrong shape"): lambda path: path.write_text('{"pose": [[0, 0, 0]]}'),
     ("pose", "NaN"): replaced(b"0.0", b"NaN"),
     ("pose", "huge number"): replaced(b"0.0", b"1e999"),
@@ -251,14 +253,11 @@ CLAIMS: dict[tuple[str, str], Callable[[Path], object]] = {
     ("AMASS", "NaN"): lambda path: with_array(path, "poses", nan),
     ("AMASS", "wrong shape"): lambda path: with_array(path, "poses", lambda values: values[:, :9]),
     ("AMASS", "hostile member"): lambda path: with_member(path, "poses.npy", objects()),
-    ("AMASS", "huge size"): lambda path: with_member(path, "poses.npy", npy("(9999999999, 156)")),
     ("AMASS", "zip bomb"): lambda path: with_member(
         path, "poses.npy", npy("(84000, 156)", bytes(84000 * 156 * 8)), zipfile.ZIP_DEFLATED
     ),
     ("depth", "hostile array"): lambda path: path.write_bytes(objects()),
     ("depth", "huge size"): lambda path: path.write_bytes(npy("(9999999999, 156)")),
-    ("depth", "no size"): lambda path: path.write_bytes(npy("(9999999999,)", kind="|V0")),
-    ("depth", "negative"): lambda path: path.write_bytes(npy("(-3, -1)", bytes(24))),
     ("payload", "wrong shape"): lambda path: with_array(path, "betas", lambda values: values[:3]),
     ("payload", "NaN"): lambda path: with_array(path, "betas", nan),
     ("payload", "huge size"): lambda path: with_member(path, "betas.npy", npy("(9999999999,)")),

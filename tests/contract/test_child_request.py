@@ -62,13 +62,6 @@ def test_a_request_runs_from_a_cold_start_to_its_files(start):
     assert not request.tick(), "a finished request stays as it is"
 
 
-def test_a_second_request_uses_the_same_child(start, backend):
-    follow(start(1))
-    first = backend.client
-    follow(start(2))
-    assert backend.client is first is not None
-
-
 def test_a_cancelled_request_leaves_nothing(start, slow_checkpoint, tmp_path):
     request = start(BUSY_STEPS, checkpoint=slow_checkpoint)
     follow(request, lambda request: request.step > 2)

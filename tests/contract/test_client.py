@@ -301,7 +301,7 @@ def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message,
         ("variations", {"people": [{"seed": 1}], "seconds": 1}, "people[0].person"),
         ("reconstruct", {"person": "a", "seconds": 1, "warnings": [None]}, "warnings[0]"),
         ("proxy", {"proxy": "a", "texture": "b", "betas": ["x"], "triangles": 1, "seconds": 1}, "betas[0]"),
-        ("merge_frames", {"files": 3, "seconds": 1}, "files"),
+        ("merge", {"files": 3, "seconds": 1}, "files"),
     ],
 )
 def test_a_result_without_what_its_method_promises_ends_the_child(fake_child, method, result, fault):

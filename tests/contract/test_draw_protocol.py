@@ -11,7 +11,7 @@ from primdiffusion.human import Human, framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from tiny_model import tiny_model
 
-CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
+CANCELLED, DOMAIN_ERROR = -32001, -32002
 STILL = torch.eye(3, 4).tolist()
 ids = itertools.count(1)
 
@@ -75,16 +75,14 @@ def ask(child: Conversation, params: dict) -> tuple[dict, list[dict]]:
     return child.until(answered), progress
 
 
-@pytest.mark.parametrize("view", ["colour", "depth", "alpha", "boxes"])
-def test_the_child_fills_the_frame(child, request_for, view):
-    params = request_for(view=view)
+def test_the_child_fills_the_frame(child, request_for):
+    params = request_for()
     answer, progress = ask(child, params)
     assert 0 < answer["result"]["seconds_place"] <= answer["result"]["seconds"]
     assert 0 <= answer["result"]["seconds_march"] <= answer["result"]["seconds"]
     combined, depth = frame_of(params)
     assert np.isfinite(combined).all()
-    shown = combined[..., 0] > 0 if view == "alpha" else combined[..., 3] > 0
-    assert 0.03 < shown.mean() < 0.7
+    assert 0.03 < (combined[..., 3] > 0).mean() < 0.7
     assert (depth[combined[..., 3] == 0] == np.float32(1e10)).all()
     assert 0.02 < (depth < 100).mean() < 0.6
     assert [p["step"] for p in progress] == sorted({p["step"] for p in progress})
@@ -110,21 +108,6 @@ def test_a_large_picture_comes_in_bands_from_the_top_and_stops_within_one(child,
     assert np.isnan(frame_of(params)[0][-1]).all()
     answer, _ = ask(child, request_for())
     assert "result" in answer, "the next picture is drawn"
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"width": 0}, "draw.width"),
-        ({"world_to_camera": [[10**400] * 4] * 3}, "draw.world_to_camera"),
-        ({"colour": 1}, "draw.colour"),
-    ],
-)
-def test_wrong_parameters_are_one_sentence(child, request_for, changes, message):
-    answer, _ = ask(child, {**request_for(), **changes})
-    assert answer["error"]["code"] == INVALID_PARAMS
-    assert message in answer["error"]["message"]
-    assert "\n" not in answer["error"]["message"]
 
 
 def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, request_for, tmp_path):

@@ -1,4 +1,4 @@
-"""Frames that both programs map, also where a mapped file cannot be removed (test_windows_rules.py)."""
+"""Frames that both programs map."""
 
 import pytest
 from primdiffusion.commands.frame_drawer import map_frame

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from editing_people import anybody
-from primdiffusion.editing.regions import region_from_weights, region_of
+from primdiffusion.editing.regions import region_from_weights
 from primdiffusion.human_file import load_human, save_human
 from tiny_model import VOCABULARY
 
@@ -79,30 +79,9 @@ def test_a_region_may_be_painted(child, people, asked, tmp_path):
     assert outside(result["person"], people["ann"], region_from_weights(torch.from_numpy(weights)))
 
 
-def test_a_plain_transfer_is_exact_and_needs_no_checkpoint(child, people, asked):
-    take = {**asked, "source": people["bob"], "region": ["top"], "checkpoint": "/nowhere.safetensors"}
-    top = region_of(["top"])
-    texture = load_human(child.ask(4, "transfer", **take)["result"]["person"])
-    garment = load_human(child.ask(5, "transfer", **take, what="garment")["result"]["person"])
-    ann, bob = load_human(people["ann"]), load_human(people["bob"])
-    assert torch.equal(texture.payload.rgb[top], bob.payload.rgb[top])
-    assert torch.equal(texture.payload.density, ann.payload.density)
-    assert torch.equal(garment.payload.density[top], bob.payload.density[top])
-
-
-def test_attributes_tells_what_generate_can_be_asked_for(child, checkpoint, asked):
+def test_attributes_tells_what_generate_can_be_asked_for(child, checkpoint):
     known = child.ask(6, "attributes", checkpoint=str(checkpoint))["result"]
     assert known == VOCABULARY.to_json()
-    (name, values), *_ = known["categories"].items()
-    made = {}
-    for value in values[:2]:
-        out = Path(asked["out_dir"]) / value
-        wanted = {"out_dir": str(out), "checkpoint": str(checkpoint), "steps": 2, "size": 32}
-        child.ask(7, "generate", seed=1, attributes={name: value}, guidance=3.0, **wanted)
-        made[value] = load_human(out / "person.human.safetensors")
-        assert made[value].provenance["attributes"] == {name: value}
-    first, second = made.values()
-    assert not torch.equal(first.payload.rgb, second.payload.rgb)
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,10 @@ pytest.importorskip("igl", reason="libigl comes with the `bake` extra")
 SCRIPT = pathlib.Path(__file__).parents[2] / "scripts/bake_layout"
 sys.path.append(str(SCRIPT))
 
-from charts import PLACES, Place, lay_out  # noqa: E402
-from cutting import cheapest_path, cut_along, outline, runs  # noqa: E402
+from charts import PLACES, lay_out  # noqa: E402
+from cutting import cut_along, outline  # noqa: E402
 from grid import chart_of_cells, draw  # noqa: E402
-from half_body import FILLED, Sheet, boundary_edges, left_half, mirror_vertices, smoothed  # noqa: E402
+from half_body import FILLED, Sheet, boundary_edges, left_half, mirror_vertices  # noqa: E402
 from rectangle import Disc, flatten  # noqa: E402
 from regions import _split, cut_into_regions  # noqa: E402
 
@@ -83,15 +83,6 @@ def test_flattening_a_bump_ends_in_a_minimum_of_distortion_and_flips_nothing():
         assert distortion(flat.disc.points, moved, flat.disc.faces) > reached - 1e-5
 
 
-def test_sides_stay_on_the_rectangle():
-    points, faces = sheet_of(6, 4)
-    flat = flatten(Disc(points, points, faces, np.arange(len(faces))), outline(faces), (0, 6, 34, 28), 3.0, 5.0)
-    np.testing.assert_allclose(flat.uv[:7, 1], 0)
-    np.testing.assert_allclose(flat.uv[28:35, 1], 5)
-    np.testing.assert_allclose(flat.uv[:35:7, 0], 0)
-    np.testing.assert_allclose(flat.uv[6:35:7, 0], 3)
-
-
 def test_a_cut_doubles_the_vertices_inside_it_and_the_loop_passes_both_copies():
     _, faces = sheet_of(4, 4)
     path = [2, 7, 12]
@@ -101,28 +92,6 @@ def test_a_cut_doubles_the_vertices_inside_it_and_the_loop_passes_both_copies():
     assert sorted(origin[loop]).count(7) == 2
     assert sorted(origin[loop]).count(12) == 1
     np.testing.assert_array_equal(origin[opened], faces)
-
-
-def test_a_ring_is_no_disc():
-    _, faces = sheet_of(3, 3)
-    inner = np.isin(faces, [5, 6, 9, 10]).sum(1) == 3
-    with refused(ValueError, "disc"):
-        outline(faces[~inner])
-
-
-def test_the_cheapest_path_goes_round_what_it_must_avoid():
-    points, faces = sheet_of(4, 4)
-    straight = cheapest_path(points, faces, 10, 14)
-    detour = cheapest_path(points, faces, 10, 14, avoid=[12])
-    assert straight == [10, 11, 12, 13, 14]
-    assert 12 not in detour
-    assert detour[0] == 10
-    assert detour[-1] == 14
-
-
-def test_runs_are_found_across_the_end_of_the_loop():
-    marked = np.array([True, True, False, False, True])
-    assert runs([0, 1, 2, 3, 4], marked) == [[4, 0, 1]]
 
 
 def test_splitting_keeps_area_orientation_and_parents():
@@ -140,25 +109,6 @@ def test_splitting_keeps_area_orientation_and_parents():
     middle = cut.points[cut.faces].mean(1)
     clear = np.abs(middle[:, 0] - 0.4 * middle[:, 1] - 1.37) > 0.3
     np.testing.assert_array_equal(positive[clear], (middle[:, 0] - 0.4 * middle[:, 1] - 1.37 > 0)[clear])
-
-
-def test_smoothing_flattens_a_spike_and_keeps_the_midline_in_its_plane():
-    points, faces = sheet_of(8, 8, lambda s, t: (0.01 * s, 0.01 * t, 0.02 * ((s == 4) & (t == 4))))
-    sheet = Sheet(points, faces, np.arange(len(faces)), points[:, 0] == 0)
-    smooth = smoothed(sheet, 0.02)
-    assert smooth[40, 2] < 0.008
-    assert (smooth[sheet.midline, 0] == 0).all()
-
-
-@pytest.mark.parametrize("quarter_turns", [0, 1, 2])
-def test_places_and_grid_coordinates_are_inverse(quarter_turns):
-    place = Place(3, 5, 2, 7, quarter_turns)
-    uv = np.random.default_rng(0).random((20, 2)) * (3, 5)
-    on_grid = place.to_grid(uv)
-    columns, rows = place.extent
-    assert (on_grid >= (2, 7)).all()
-    assert (on_grid <= (2 + columns, 7 + rows)).all()
-    np.testing.assert_allclose(place.from_grid(on_grid), uv)
 
 
 def test_the_charts_tile_the_grid():

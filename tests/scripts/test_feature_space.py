@@ -7,7 +7,7 @@ import torch
 from diffusion_people import write_people
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.people.stored_people import find_people, read_person
+from primdiffusion.people.stored_people import find_people
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
@@ -15,7 +15,7 @@ from support.errors import refused
 from tiny_model import tiny_model
 
 from scripts.feature_space import __main__ as command
-from scripts.feature_space.comparison import COLUMNS, compare, open_reference_set, real_vs_real, table
+from scripts.feature_space.comparison import COLUMNS, compare, open_reference_set, real_vs_real
 from scripts.feature_space.network import features_of
 from scripts.feature_space.portraits import (
     PORTRAITS,
@@ -26,7 +26,6 @@ from scripts.feature_space.portraits import (
     mesh_sources,
     open_gallery,
     payload_sources,
-    read_seed,
 )
 from scripts.train_attribute_network import accuracies, train_reference
 
@@ -86,22 +85,6 @@ def never():
     raise AssertionError("drawn again")
 
 
-def test_damaged_portraits_are_drawn_again(people, tmp_path):
-    paths = find_people(people)[:1]
-    sources = payload_sources(paths)
-    first = open_gallery(sources, tmp_path)
-    (tmp_path / paths[0].name).write_bytes(b"half a file")
-    assert torch.equal(open_gallery(sources, tmp_path).pictures, first.pictures)
-
-
-def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
-    path = find_people(people)[3]
-    person = read_person(path)
-    drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), person.payload(1))])
-    assert torch.equal(open_gallery(payload_sources([path]), tmp_path).pictures[1], drawn[0])
-    assert int((drawn[..., 3] > 128).sum()) > 500
-
-
 def test_portraits_of_meshes_and_of_their_payloads_show_the_same_people(assets, tmp_path):
     drawn = open_gallery(mesh_sources(assets, [3], 2), tmp_path)
     people = coloured_people(assets, 3, 2)
@@ -114,12 +97,6 @@ def test_portraits_of_meshes_and_of_their_payloads_show_the_same_people(assets, 
     difference = (drawn.pictures[1].float() - boxes.float())[seen].abs().mean()
     assert float(difference) < 16
     assert drawn.attributes[1]["outfit"] == people[1].attributes["outfit"]
-
-
-def test_a_file_without_a_seed_is_named(tmp_path):
-    (tmp_path / "person.npz").write_bytes(b"nothing")
-    with refused(ValueError, "person.npz"):
-        read_seed(tmp_path / "person.npz")
 
 
 def test_copies_of_training_samples_are_distinguished_from_new_ones(reference):
@@ -144,13 +121,6 @@ def test_reference_set_is_read_back_from_its_folder(people, reference, reference
     )
     assert torch.equal(reference.held_features, again.held_features)
     assert torch.equal(features_of(again.network, again.train.pictures), again.train_features)
-
-
-def test_table_has_a_row_for_each_set(reference):
-    lines = table({"one": compare(reference, reference.held_features)}).splitlines()
-    assert len({line.count("|") for line in lines}) == 1
-    assert lines[0].count("|") == len(COLUMNS) + 2
-    assert lines[2].startswith("| one | 4 |")
 
 
 @pytest.fixture

@@ -63,26 +63,6 @@ def test_what_is_free_and_what_is_needed_is_one_sentence(checkout, disks):
     setup.check_room([setup.VENV, setup.VENV52])
 
 
-def test_what_is_installed_is_not_asked_for_again(checkout, disks):
-    setup.VENV.mkdir()
-    (setup.VENV / "ready").touch()
-    disks(1)
-    setup.check_room([setup.VENV])
-    with pytest.raises(setup.Stop):
-        setup.check_room([setup.VENV, setup.VENV52])
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="/proc is another disk")
-def test_pips_temporary_folder_on_another_disk_counts_by_itself(disks):
-    disks(3800, 1600)
-    setup.check_room([setup.VENV])
-    disks(9000, 100)
-    with pytest.raises(setup.Stop) as raised:
-        setup.check_room([setup.VENV])
-    assert "0.1 GB are free on the disk of /proc, and 1.5 GB are needed" in str(raised.value)
-    assert "TMPDIR" in str(raised.value)
-
-
 def test_all_tests_run_on_three_blenders_in_environments_that_are_made_once(checkout, disks, monkeypatch):
     disks(99_999)
     monkeypatch.setattr(setup, "python313", lambda: "python3.13")
@@ -126,60 +106,6 @@ def test_a_red_version_keeps_no_other_from_running_and_the_last_lines_say_which(
     assert tests == [setup.program(folder) for folder in versions.values()]
     said = [f"Blender {name}: " + ("FAILED (exit code 3)" if name in red else "passed") for name in versions]
     assert capsys.readouterr().out.splitlines()[-3:] == said
-
-
-def test_a_version_that_cannot_be_set_up_is_red_with_its_reason_and_one_without_its_python_not_tested(
-    checkout, disks, monkeypatch, capsys
-):
-    disks(99_999)
-    monkeypatch.setattr(setup, "python313", lambda: "python3.13")
-    make = setup.ready_313
-
-    def no_room(folder, python):
-        if folder == setup.VENV52:
-            raise setup.Stop("no room")
-        make(folder, python)
-
-    monkeypatch.setattr(setup, "ready_313", no_room)
-    with pytest.raises(SystemExit) as ended:
-        setup.test([])
-    assert ended.value.code == 1
-    last = capsys.readouterr().out.splitlines()[-3:]
-    assert last == ["Blender 5.0: passed", "Blender 5.2: FAILED: no room", "Blender 5.3: passed"]
-    monkeypatch.setattr(setup, "python313", lambda: None)
-    setup.test([])
-    last = capsys.readouterr().out.splitlines()[-3:]
-    assert [line.partition(",")[0] for line in last[1:]] == ["Blender 5.2: not tested", "Blender 5.3: not tested"]
-
-
-def test_without_a_python_for_them_newer_blenders_are_left_out_and_named(checkout, disks, monkeypatch, capsys):
-    disks(99_999)
-    monkeypatch.setenv("PYTHON313", "")
-    for test_one, version in ((setup.test_52, "5.2"), (setup.test_53, "5.3")):
-        test_one([])
-        said = capsys.readouterr().out
-        assert f"Blender {version} was not tested" in said
-        assert "PYTHON313" in said
-    assert checkout.commands == []
-
-
-def test_another_python_than_311_that_was_chosen_is_an_error_that_names_it(monkeypatch):
-    monkeypatch.setattr(setup.sys, "version_info", (3, 12, 0))
-    monkeypatch.setenv("PYTHON", sys.executable)
-    with pytest.raises(setup.Stop) as raised:
-        setup.python311()
-    assert sys.executable in str(raised.value)
-
-
-def test_a_command_that_fails_ends_it_with_its_code():
-    with pytest.raises(SystemExit) as ended:
-        setup.run([sys.executable, "-c", "raise SystemExit(7)"])
-    assert ended.value.code == 7
-
-
-def test_commands_write_byte_code_even_where_a_container_forbids_it(monkeypatch):
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
-    assert "PYTHONDONTWRITEBYTECODE" not in setup.environment()
 
 
 def test_an_unknown_target_is_an_error_that_lists_all():

@@ -1,7 +1,7 @@
 """Load body models in SMPL's file format: the user's own SMPL files, or any body in the same layout.
 
 SMPL is licensed by its authors and never part of this package. Its files hold no texture coordinates, which the layout
-of primitives needs, so these come from a second file or from an automatic unwrap.
+of primitives needs, so these come from a second file.
 """
 
 from __future__ import annotations
@@ -15,37 +15,29 @@ from primdiffusion.body.model import BodyModel, J
 from primdiffusion.files.arrays import all_finite, array_names, read_arrays, read_npy
 from primdiffusion.files.regular_files import FileError, check_regular, check_size, read_regular
 from primdiffusion.files.smpl_pickle import as_array, read_pickle
-from primdiffusion.runtime.failures import optional_package
 
 LARGEST_BODY_FILE = 512 * 2**20
 """SMPL with 300 shape components takes 250 MB."""
 LARGEST_OBJ = 32 * 2**20
 MOST_FACES, MOST_NUMBERS = 100_000, 32_000_000
-"""Faces of a body, and numbers in one of its arrays: five and two times SMPL-X's. They become larger types, and a body
-without texture coordinates is unwrapped in a time that grows with its faces."""
+"""Faces of a body, and numbers in one of its arrays: five and two times SMPL-X's. They become larger types."""
 LARGEST_BODY_M = 1000.0
-"""The automatic unwrap of larger ones takes minutes."""
 SHAPE_COMPONENTS = 10
 """Shape components loaded by default, of the up to 300 in SMPL files."""
 POSE_FEATURES = (J - 1) * 9
-_NO_XATLAS = (
-    "the body has no texture coordinates, and this Python has no xatlas to make some: give them by a second file (uv), "
-    "or install xatlas"
-)
 _ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
 """Encodings of "no parent": -1, or -1 converted to an unsigned integer."""
 
 
 def load_body(
-    path: str | Path, uv: str | Path | tuple[Path, Path] | None = None, shape_components: int = SHAPE_COMPONENTS
+    path: str | Path, uv: str | Path | tuple[Path, Path], shape_components: int = SHAPE_COMPONENTS
 ) -> BodyModel:
     """Load a body (float32) from an SMPL .pkl or .npz.
 
     Args:
         path: the body model. Pickles are read by `smpl_pickle` and cannot run code.
         uv: texture coordinates: an .obj with the body's vertex indices, an .npz with vt [T, 2] and ft [F, 3], or
-            the pair (vt.npy, ft.npy). Defaults to "vt" and "ft" of the model file or, if absent, an automatic
-            unwrap (takes seconds; many small islands).
+            the pair (vt.npy, ft.npy).
         shape_components: maximum number of leading shape components to load; files hold 10 to 300.
 
     Raises:
@@ -67,7 +59,7 @@ def load_body(
     if skin_weights.min() < -1e-4 or np.abs(skin_weights.sum(1) - 1).max() > 1e-2:
         raise arrays.wrong("weights", "has rows that are no weights (non-negative, with sum 1)")
     regressor = arrays.real("J_regressor", (J, vertex_count))
-    coordinates, coordinate_faces = _texture_coordinates(arrays, uv, template, faces)
+    coordinates, coordinate_faces = _texture_coordinates(uv, faces)
     return BodyModel(
         template=torch.from_numpy(template),
         shape_basis=torch.from_numpy(np.ascontiguousarray(shape_basis)),
@@ -152,23 +144,16 @@ def _parents(arrays: _ArrayFile) -> np.ndarray:
     return parents
 
 
-def _texture_coordinates(
-    arrays: _ArrayFile, uv: str | Path | tuple[Path, Path] | None, template: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    given = () if uv is None else tuple(map(Path, uv if isinstance(uv, tuple) else (uv,)))
-    source: Path | str = given[-1] if given else arrays.file
+def _texture_coordinates(uv: str | Path | tuple[Path, Path], faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    given = tuple(map(Path, uv if isinstance(uv, tuple) else (uv,)))
+    source = given[-1]
     if len(given) == 2:
         coordinates, coordinate_faces = map(_numpy_file, given)
-    elif given and given[0].suffix == ".npz":
-        held = _ArrayFile(given[0])
+    elif source.suffix == ".npz":
+        held = _ArrayFile(source)
         coordinates, coordinate_faces = held.raw("vt"), held.raw("ft")
-    elif given:
-        coordinates, coordinate_faces = _obj_texture_coordinates(given[0], faces)
-    elif "vt" in arrays and "ft" in arrays:
-        coordinates, coordinate_faces = arrays.raw("vt"), arrays.raw("ft")
     else:
-        coordinate_faces, coordinates = _unwrapped(template, faces)
-        source = f"the automatic unwrap of {arrays.file.name}"
+        coordinates, coordinate_faces = _obj_texture_coordinates(source, faces)
     numbers = coordinates.dtype.kind in "iuf" and coordinate_faces.dtype.kind in "iuf"
     if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise FileError(
@@ -183,13 +168,6 @@ def _texture_coordinates(
             source, "has texture coordinates that are NaN or numbered out of range", "use the body's own UV file"
         )
     return coordinates.astype(np.float32), coordinate_faces
-
-
-def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unwrap automatically; return UV faces and coordinates."""
-    xatlas = optional_package("xatlas", missing=_NO_XATLAS)  # it has no wheels for Python 3.14 or Linux on ARM
-    _, coordinate_faces, coordinates = xatlas.parametrize(template, faces.astype(np.uint32))
-    return coordinate_faces, coordinates
 
 
 def _numpy_file(file: Path) -> np.ndarray:

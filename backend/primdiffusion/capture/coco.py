@@ -2,12 +2,12 @@
 
     root/annotations.json    images, persons with boxes, run-length masks and COCO's 17 keypoints; cameras, SMPL and
                              attributes too
-    root/composed/           images over backgrounds, if pictures for them are given, and of humans who stand together
+    root/composed/           images of humans who stand together
 
 Each human is captured alone; annotations put those who stand together into one image, so that one who is partly hidden
 has a whole mask too.
 
-All follow from the files of the captures (and these pictures) alone, so that the same captures give the same bytes.
+All follow from the files of the captures alone, so that the same captures give the same bytes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.capture.composed import Backgrounds, composed_path, drawn_box, uncovered, write_composed
+from primdiffusion.capture.composed import composed_path, drawn_box, uncovered, write_composed
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_from_body, joints_of
 from primdiffusion.files.picture_files import DEPTH_UNIT
@@ -73,12 +72,11 @@ _FARTHEST = DEPTH_UNIT * np.iinfo(np.uint16).max
 def write_coco(
     captures: Captures,
     attributes: Mapping[str, Mapping[str, Any]],
-    backgrounds: Backgrounds | None = None,
     report: Callable[[str], object] = lambda subject: None,
 ) -> None:
     """Write annotations.json into the captures' folder; it appears at the end or not at all.
 
-    With backgrounds, and of humans who stand together (`groups`), composed images are written, which are annotated.
+    Of humans who stand together (`groups`), composed images are written, which are annotated.
 
     Keypoints are indices of pixels as COCO's: the centre of the upper left pixel is (0, 0). Their visibility is COCO's:
     0 outside of the image or unknown, 1 hidden, 2 visible. The face's are known where the subject has the default body.
@@ -87,7 +85,6 @@ def write_coco(
     Args:
         captures: images, masks and depth of finished subjects.
         attributes: values by subject and name; a subject may lack all or some.
-        backgrounds: pictures to draw from for each view; without them, annotated images are those of the captures.
         report: called with the name of each annotated subject.
 
     Raises:
@@ -99,9 +96,9 @@ def write_coco(
     with replacing(captures.root / ANNOTATIONS_FILE) as path, path.open("w", encoding="utf-8", newline="\n") as file:
         file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
         file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
-        file.writelines(_separated(_line(image.record) for image in _images(captures, backgrounds)))
+        file.writelines(_separated(_line(image.record) for image in _images(captures)))
         file.write('],\n"annotations":[\n')
-        file.writelines(_separated(_annotations(captures, attributes, backgrounds, report)))
+        file.writelines(_separated(_annotations(captures, attributes, report)))
         file.write("]}\n")
 
 
@@ -191,7 +188,6 @@ class _Image:
     subjects: tuple[Subject, ...]
     frame: int
     camera: int
-    background: Path | None
     kind: str = "img"
     """Pass that is annotated where nothing is composed."""
 
@@ -201,7 +197,7 @@ class _Image:
 
     @property
     def is_composed(self) -> bool:
-        return self.background is not None or len(self.subjects) > 1
+        return len(self.subjects) > 1
 
     @property
     def file_name(self) -> str:
@@ -238,8 +234,8 @@ class _Image:
         shares = uncovered(parts, [depth[box] for depth in depths], hips)
         if self.is_composed:
             cut = [image[box] for image in images]
-            write_composed(cut, shares, box, self.subjects[0], self.frame, self.camera, self.background)
-        for subject, mask, part, share, own in zip(self.subjects, masks, parts, shares[:-1], points, strict=True):
+            write_composed(cut, shares, box, self.subjects[0], self.frame, self.camera)
+        for subject, mask, part, share, own in zip(self.subjects, masks, parts, shares, points, strict=True):
             seen = np.zeros(mask.shape, np.bool_)
             seen[box] = share * part >= THRESHOLD
             if seen.any():
@@ -297,25 +293,23 @@ def groups(captures: Captures) -> list[tuple[Subject, ...]]:
     ]
 
 
-def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Image]:
+def _images(captures: Captures) -> Iterator[_Image]:
     """All images by subjects, frame and camera, numbered from 1."""
     number, kind = 0, "hdri" if "hdri" in captures.passes else "img"
     for subjects in groups(captures):
         for frame in range(subjects[0].frames):
             for camera in range(len(subjects[0].views)):
                 number += 1
-                background = None if backgrounds is None else backgrounds.drawn(subjects[0].name, frame, camera)
-                yield _Image(number, subjects, frame, camera, background, kind)
+                yield _Image(number, subjects, frame, camera, kind)
 
 
 def _annotations(
     captures: Captures,
     attributes: Mapping[str, Mapping[str, Any]],
-    backgrounds: Backgrounds | None,
     report: Callable[[str], object],
 ) -> Iterator[str]:
     number, points = 0, []
-    for image in _images(captures, backgrounds):
+    for image in _images(captures):
         if image.frame == image.camera == 0:
             points = [keypoints_of(subject) for subject in image.subjects]
         for annotation in image.annotations(points):

@@ -1,9 +1,7 @@
-"""Images composed of finished captures, which are of one human over black: several humans, and pictures behind them."""
+"""Images of several humans, composed of finished captures, which are of one human over black."""
 
 from __future__ import annotations
 
-import dataclasses
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,26 +13,12 @@ from PIL import Image
 from primdiffusion.capture.reader import Subject
 from primdiffusion.capture.render import JPEG_QUALITY
 from primdiffusion.files.picture_files import DEPTH_UNIT
-from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import replacing
 from primdiffusion.formats import capture_layout
-from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, BYTE_STEPS, LINEAR_OF_BYTE
 
 FOLDER = "composed"
 """Folder of composed images, in that of the captures."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Backgrounds:
-    """Pictures to draw from for each view."""
-
-    paths: tuple[Path, ...]
-    seed: int = 0
-
-    def drawn(self, subject: str, frame: int, camera: int) -> Path:
-        """The picture behind a view; the order of views has no influence."""
-        return self.paths[capture_layout.view_seed(self.seed, subject, frame, camera) % len(self.paths)]
 
 
 def composed_path(subject: Subject, frame: int, camera: int) -> Path:
@@ -45,26 +29,20 @@ def composed_path(subject: Subject, frame: int, camera: int) -> Path:
 
 def write_composed(
     images: Sequence[UInt8[np.ndarray, "h w 3"]],
-    shares: Float32[np.ndarray, "n+1 h w"],
+    shares: Float32[np.ndarray, "n h w"],
     box: Box,
     subject: Subject,
     frame: int,
     camera: int,
-    background: Path | None,
 ) -> None:
-    """Write an image of all humans in a view, of whom `subject` is the first, over a background or black, atomically.
+    """Write an image of all humans in a view, of whom `subject` is the first, over black, atomically.
 
-    `images` and their `uncovered` shares are of the box alone.
-
-    Raises:
-        FileNotFoundError, FileError: an image or the background is missing or damaged.
-        FileError, OSError: the file cannot be written, or lies behind a link out of the captures.
+    `images` and their `uncovered` shares are of the box alone. Raises FileError, OSError where the file cannot be
+    written, or lies behind a link out of the captures.
     """
     path, view = composed_path(subject, frame, camera), subject.views[camera]
     image = np.zeros((view.height, view.width, 3), np.uint8)
-    if background is not None:
-        image = read_background(background, view.width, view.height)
-    image[box] = compose(images, shares, image[box])
+    image[box] = compose(images, shares)
     with replacing(path, subject.folder.parent) as partial:
         Image.fromarray(image).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
 
@@ -88,28 +66,25 @@ def _extent(values: Sequence[UInt8[np.ndarray, "n"]]) -> slice:
 
 def uncovered(
     masks: Sequence[UInt8[np.ndarray, "H W"]], depths: Sequence[UInt16[np.ndarray, "H W"]], distances: Sequence[float]
-) -> Float32[np.ndarray, "n+1 H W"]:
-    """The share of each pixel that nearer humans leave to each human, and, last, to the background.
+) -> Float32[np.ndarray, "n H W"]:
+    """The share of each pixel that nearer humans leave to each human.
 
     `distances` are the depths of the hips, metres, for pixels of a mask without a depth: edges.
     """
-    shares = np.ones((len(masks) + 1, *masks[0].shape), np.float32)
+    shares = np.ones((len(masks), *masks[0].shape), np.float32)
     _uncovered(np.stack(masks), np.stack(depths), np.array(distances), _LEFT_BY_BYTE, shares)
     return shares
 
 
 def compose(
-    images: Sequence[UInt8[np.ndarray, "H W 3"]],
-    shares: Float32[np.ndarray, "n+1 H W"],
-    background: UInt8[np.ndarray, "H W 3"],
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], shares: Float32[np.ndarray, "n H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw all humans and the background in linear light, nearer over farther; colours are premultiplied over black.
+    """Draw all humans in linear light, nearer over farther; colours are premultiplied over black.
 
     `shares` are those of `uncovered`.
     """
-    image = np.empty_like(background, order="C")
-    layers = np.stack([*images, background])
-    _compose(layers, shares, LINEAR_OF_BYTE, BYTE_OF_LINEAR, image)
+    image = np.empty_like(images[0], order="C")
+    _compose(np.stack(images), shares, LINEAR_OF_BYTE, BYTE_OF_LINEAR, image)
     return image
 
 
@@ -141,7 +116,6 @@ def _uncovered(masks, depths, distances, left_by_byte, shares):
             for human in order:
                 shares[human, row, column] = left
                 left *= left_by_byte[masks[human, row, column]]
-            shares[humans, row, column] = left
 
 
 @numba.njit(cache=True, nogil=True)
@@ -156,20 +130,3 @@ def _compose(layers, shares, linear_of_byte, byte_of_linear, image):
                 image[row, column, channel] = byte_of_linear[
                     int(min(total, np.float32(1)) * np.float32(BYTE_STEPS - 1) + np.float32(0.5))
                 ]
-
-
-def read_background(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
-    """Read a PNG, JPEG or WebP: its middle, as large as the proportions allow, resampled to `width` x `height`.
-
-    Raises:
-        FileNotFoundError: it does not exist.
-        FileError: it is damaged.
-    """
-    if not os.path.lexists(path):
-        raise FileNotFoundError(f"the background {path} does not exist: check the path")
-    unusable = as_file_error(path, "is not a picture for backgrounds", "take it out of the folder", OSError)
-    with unusable, opened_picture(path, ("PNG", "JPEG", "WEBP")) as picture:
-        scale = min(picture.width / width, picture.height / height)
-        left, top = (picture.width - scale * width) / 2, (picture.height - scale * height) / 2
-        box = (left, top, left + scale * width, top + scale * height)
-        return np.array(picture.convert("RGB").resize((width, height), Image.Resampling.BICUBIC, box))

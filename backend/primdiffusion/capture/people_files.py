@@ -65,22 +65,16 @@ class SkinnedPerson:
 
 
 def find_people(folder: str | Path) -> dict[str, Path]:
-    """Find the .glb files in a folder, sorted by name: NAME/person.glb or NAME.glb.
+    """Find the humans of `primdiffusion people` in a folder: NAME/person.glb, sorted by name.
 
     Raises:
         FileNotFoundError: the folder does not exist or contains none.
     """
-    folder = Path(folder)
-    inner = [p for p in folder.iterdir() if p.is_dir() and p.name == "people"] if folder.is_dir() else []
-    found: dict[str, Path] = {}
-    for place in (folder, *inner):
-        for path in [*place.glob("*/person.glb"), *place.glob("*.glb")]:
-            name = path.parent.name if path.name == "person.glb" and path.parent != folder else path.stem
-            if SUBJECT_NAME.fullmatch(name):
-                found.setdefault(name, path)
+    found = {path.parent.name: path for path in sorted(Path(folder).glob("*/person.glb"))}
+    found = {name: path for name, path in found.items() if SUBJECT_NAME.fullmatch(name)}
     if not found:
         raise FileNotFoundError(f"{folder} contains no NAME/person.glb: make some with primdiffusion people")
-    return dict(sorted(found.items()))
+    return found
 
 
 def read_person(path: str | Path) -> SkinnedPerson:

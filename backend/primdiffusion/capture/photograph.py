@@ -1,8 +1,8 @@
 """Plain pictures of one person: what is cut out of them for reconstruction, and what is wrong with others.
 
-A picture shows who is meant by its alpha, or by a mask file: opaque where the person is, or white if it has no alpha,
-or of the person's label. The orientation that cameras write into EXIF is applied to both, each by its own. Only the
-square around the person is kept, scaled down.
+A picture shows who is meant by its alpha, or by a mask file: opaque where the person is, or white if it has no alpha;
+or of the person's label, if that is named. The orientation that cameras write into EXIF is applied to both, each by its
+own. Only the square around the person is kept, scaled down.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 from scipy import ndimage
 
 from primdiffusion.capture.reader import Window, resample
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.geometry.pictures import decoded, is_indexed, label_values, opened_picture
+from primdiffusion.geometry.pictures import decoded, label_values, opened_picture
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
 LARGEST_SIDE = 512
@@ -34,16 +34,12 @@ SPECK = 0.01
 """Share below which a component is a fault of the mask; those between are parts of the person behind something."""
 MASK_SIDE = 512
 """Largest side of the mask in which components are counted."""
-FLAT = 5
-"""Side in pixels of that mask of an area by which a value is a label."""
-MOST_LABELS = 12
-"""Labels that an error lists."""
 MARGIN = 0.08
 """Empty border around the person, as a share of the longer side of its box."""
 LONG_SIDE_DEGREES = 45.0
 """Field of view along the longer side where a picture does not state its lens: a lens of 43 mm on 35 mm film."""
 FILM_MM = 36.0
-_ORIENTATION, _EXIF, _FOCAL_35_MM = ExifTags.Base.Orientation, ExifTags.IFD.Exif, ExifTags.Base.FocalLengthIn35mmFilm
+_EXIF, _FOCAL_35_MM = ExifTags.IFD.Exif, ExifTags.Base.FocalLengthIn35mmFilm
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,14 +91,13 @@ def read_photographs(
     """Read pictures of one person, with a mask file for each or with alpha; squares of the same side.
 
     `outline` draws a body over an opaque picture without a mask file, of a width and height in pixels; it stands for
-    the mask of such a picture, which is kept `uncut`. `mask_label` is the person's in masks of several labels: the
-    index in the palette, or else the grey value.
+    the mask of such a picture, which is kept `uncut`. `mask_label` is the person's in masks of labels: the index in the
+    palette, or else the grey value.
 
     Raises:
         ValueError: there are not as many masks as pictures.
         FileNotFoundError: a file is missing.
-        FileError: a file is not a PNG or JPEG, is damaged or too large, or shows no person, or more than one person; a
-            mask has several labels and `mask_label` is not one of them.
+        FileError: a file is not a PNG or JPEG, is damaged or too large, or shows no person, or more than one person.
     """
     if masks and len(masks) != len(pictures):
         raise ValueError(f"there are {len(masks)} masks for {len(pictures)} pictures: give one for each, or none")
@@ -130,7 +125,7 @@ def _figure(
     """A person before it is scaled."""
     with _picture(path) as picture:
         focal, bands = _focal_length(picture), picture.getbands()
-        pixels = _upright(decoded(picture, "RGBA"), picture)
+        pixels = decoded(ImageOps.exif_transpose(picture), "RGBA")
     uncut = mask_path is None and outline is not None and pixels[..., 3].min() == 255
     if uncut and outline is not None:
         mask = outline(pixels.shape[1], pixels.shape[0])
@@ -146,7 +141,7 @@ def _figure(
             raise FileError(path, "is opaque everywhere", "cut the person out, or give a mask file for it")
     else:
         with _picture(mask_path) as picture:
-            mask = _upright(_coverage(picture, mask_path, mask_label), picture)
+            mask = _coverage(ImageOps.exif_transpose(picture), mask_label)
         if mask.shape != pixels.shape[:2]:
             size = f"{mask.shape[1]} x {mask.shape[0]} pixels"
             raise FileError(
@@ -186,60 +181,18 @@ def _focal_length(picture: Image.Image) -> float | None:
     return stated / FILM_MM if 5 <= stated <= 1000 else None
 
 
-def _upright(pixels: np.ndarray, picture: Image.Image) -> np.ndarray:
-    """Turn and mirror as EXIF says; a view."""
-    try:
-        orientation = int(picture.getexif().get(_ORIENTATION) or 1)
-    except (TypeError, ValueError, SyntaxError):
-        orientation = 1
-    if orientation in (5, 6, 7, 8):
-        pixels = pixels.swapaxes(0, 1)
-    if orientation in (3, 4, 7, 8):
-        pixels = pixels[::-1]
-    if orientation in (2, 3, 6, 7):
-        pixels = pixels[:, ::-1]
-    return pixels
-
-
-def _coverage(picture: Image.Image, path: Path, label: int | None) -> UInt8[np.ndarray, "H W"]:
-    """255 where the person is in a mask file, less at soft edges.
-
-    Alpha counts if some of it is not opaque. Otherwise the file holds labels, of which the person's is `label`, or of
-    only two the brighter (0 and 1, black and one colour of a palette); or it is grey: white where the person is.
-    """
+def _coverage(picture: Image.Image, label: int | None) -> UInt8[np.ndarray, "H W"]:
+    """255 where the person is in a mask file, less at soft edges: of `label`, else by alpha if some of it is not
+    opaque, else by brightness."""
+    if label is not None:
+        return np.where(label_values(picture) == label, np.uint8(255), np.uint8(0))
     if picture.has_transparency_data:
         alpha = decoded(picture, "LA")[..., 1]
         if alpha.min() < 255:
             return alpha
-    values = label_values(picture)
-    present = np.unique(values)
-    if label is not None:
-        if label not in present:
-            raise FileError(path, f"has no pixel of label {label}", f"it has {_listed(present)}: choose one of them")
-        return np.where(values == label, np.uint8(255), np.uint8(0))
-    if len(present) <= 2:
-        brightness = decoded(picture, "L") if is_indexed(picture) else values
-        brightest = brightness.argmax()
-        return np.where(
-            (values == values.flat[brightest]) & (brightness.flat[brightest] > 0), np.uint8(255), np.uint8(0)
-        )
-    if is_indexed(picture) or _are_labels(values):
-        count = f"has {len(present)} labels, {_listed(present)}"
-        raise FileError(path, count, "choose the person's with mask_label")
-    return values.astype(np.uint8) if values.max() <= 255 else (values // 257).astype(np.uint8)
-
-
-def _listed(labels: np.ndarray) -> str:
-    shown = ", ".join(map(str, labels[:MOST_LABELS]))
-    return shown if len(labels) <= MOST_LABELS else f"{shown} and {len(labels) - MOST_LABELS} more"
-
-
-def _are_labels(values: np.ndarray) -> bool:
-    """Whether most of the values fill areas: those of soft edges and of JPEG's noise do not."""
-    block = math.ceil(max(values.shape) / MASK_SIDE)
-    small = values[::block, ::block]
-    flat = small[ndimage.minimum_filter(small, FLAT) == ndimage.maximum_filter(small, FLAT)]
-    return len(np.unique(flat)) > max(2, len(np.unique(small)) / 2)
+    if picture.mode.startswith("I"):
+        return (label_values(picture) // 257).astype(np.uint8)
+    return decoded(picture, "L")
 
 
 def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, int, int, int], np.ndarray]:
@@ -250,7 +203,7 @@ def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, 
     ndimage.label(small, np.ones((3, 3)), output=labels)
     count = int(labels.max())
     if not count:
-        raise FileError(path, "shows no person: no pixel is half covered", "mark the person, white or opaque")
+        raise FileError(path, "shows no person: no pixel is half covered", "mark the person white, or name a label")
     areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     largest = areas.max()
     figures = _figures_beside(labels, 1 + np.flatnonzero(areas >= SECOND_FIGURE * largest), 1 + int(areas.argmax()))

@@ -21,7 +21,6 @@ FUNCTIONS = {
     "proxy": "export:proxy",
     "gaussians": "export:gaussians",
     "merge": "merge:merge",
-    "merge_frames": "merge:merge_frames",
     "info": "info:info",
     "attributes": "info:attributes",
     "people": "people:people",

@@ -1,9 +1,8 @@
-"""Multi-view captures: `primdiffusion captures` render, info, sheet, export, coco and farm."""
+"""Multi-view captures: `primdiffusion captures` render, sheet, export, coco and farm."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.camera_files import Project, export_cameras
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, write_coco
-from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
@@ -24,7 +22,6 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
 from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
 from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
-from primdiffusion.evaluation.images import folder_pictures
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
@@ -153,30 +150,6 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 @dataclasses.dataclass(frozen=True)
-class InfoOfCaptures:
-    """Describe a capture dataset, as JSON."""
-
-    root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset, of this program or in the released layout."""
-
-    def run(self) -> None:
-        """Print one JSON object."""
-        captures = open_captures(self.root)
-        first = captures.subject(captures.subjects[0])
-        view = first.views[0]
-        about = {
-            "subjects": len(captures.subjects),
-            "frames": first.frames,
-            "cameras": len(first.views),
-            "size": [view.width, view.height],
-            "passes": captures.passes,
-            "first_subject": first.name,
-            "dataset": captures.about or "released layout, without dataset.json",
-        }
-        print(json.dumps(about, indent=2))
-
-
-@dataclasses.dataclass(frozen=True)
 class SheetOfCaptures:
     """Draw a contact sheet of views, every other one with the joints."""
 
@@ -224,19 +197,14 @@ class AnnotateCaptures:
     """Folder of a capture dataset, with images, masks and depth; the file goes there."""
     people: Path | None = None
     """Folder of `primdiffusion people` that the captures show: its attributes are annotated too."""
-    backgrounds: Path | None = None
-    """Folder of pictures to put behind the humans; the default leaves the images over black."""
-    seed: int = 0
-    """Seed of the choice of a background for each image."""
 
     def run(self) -> None:
         """Write the file, and print its path."""
         captures = open_captures(self.root)
         cards = {} if self.people is None else read_cards(self.people)
         attributes = {name: card.get("attributes", {}) for name, card in cards.items()}
-        backgrounds = self.backgrounds and Backgrounds(tuple(folder_pictures(self.backgrounds)), self.seed)
         with tqdm(total=len(captures.subjects), unit="human", disable=None) as progress:
-            write_coco(captures, attributes, backgrounds, lambda _: progress.update())
+            write_coco(captures, attributes, lambda _: progress.update())
         print(self.root / ANNOTATIONS_FILE)
 
 
@@ -265,7 +233,6 @@ class FarmCaptures(Farm):
 
 Command = (
     Annotated[RenderCaptures, tyro.conf.subcommand("render")]
-    | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
     | Annotated[ExportCaptures, tyro.conf.subcommand("export")]
     | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]

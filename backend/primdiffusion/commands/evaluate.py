@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from tqdm import tqdm
@@ -34,13 +34,13 @@ from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_dep
 from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,
     Inception,
-    Resize,
     load_clip_vision,
     load_inception,
 )
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
 from primdiffusion.evaluation.tables import (
     FRAMES_TIMED,
+    KID_SEED,
     Networks,
     Scores,
     check_counts,
@@ -121,13 +121,11 @@ class EvaluateReconstruction:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateGeneration:
-    """Measure what the paper's tables have, at 512 x 512, and the same by our own network.
+    """Measure what the paper's Tables 1 and 2 have, at 512 x 512, and the same by our own network.
 
     Weights files are of the networks that publish them.
     """
 
-    table: Literal["1", "2"] = "1"
-    """Table of the paper."""
     assets: Path | None = None
     """MakeHuman's assets, whose meshes are rendered for --real."""
     checkpoint: Path | None = None
@@ -156,14 +154,10 @@ class EvaluateGeneration:
     """Weights of FID's Inception-V3, pt_inception-2015-12-05-6726825d.pth or torch-fidelity's file."""
     clip: Path | None = None
     """Weights of CLIP's ViT-B/32, under OpenAI's names."""
-    resize: Resize = "torch-fidelity"
-    """Resizing of pictures for Inception and CLIP."""
     kid_subsets: Count = 100
     """Number of random subsets for KID."""
     kid_subset_size: Count = 1000
     """Pictures of each subset."""
-    kid_seed: int = 2020
-    """Seed of the subsets; torch-fidelity's default."""
 
     def run(self) -> None:
         """Evaluate, and print a table. Raises as `measure`."""
@@ -180,7 +174,6 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
     Raises:
         ValueError, FileNotFoundError: files are missing, damaged or of other networks, or there are too few pictures.
     """
-    number = int(command.table)
     poses = choose_poses([read_motion(path) for path in command.motion], command.poses, 0)
     grid = command.count * command.poses * command.views
     check_counts(*(len(folder_pictures(path)) if path is not None else grid for path in (command.fake, command.real)))
@@ -191,8 +184,8 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
         reals = mesh_images_of_seeds(open_assets(command.assets), seeds, poses, command.views)
     networks = Networks(
         load_pose_depth_network(),
-        None if command.inception is None else load_inception(command.inception, command.resize),
-        None if command.clip is None else load_clip_vision(command.clip, command.resize),
+        None if command.inception is None else load_inception(command.inception),
+        None if command.clip is None else load_clip_vision(command.clip),
     )
     model, fps, resolution = None, None, None
     if command.fake is None:
@@ -204,22 +197,20 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
         fakes = folder_images(command.fake)
     fake = _scores(fakes, networks, "generated")
     real = _scores(reals, networks, "real")
-    rows = compare_pictures(fake, real, command.kid_subsets, command.kid_subset_size, command.kid_seed)
+    rows = compare_pictures(fake, real, command.kid_subsets, command.kid_subset_size)
     if fps is not None:
         rows["generated"]["fps"] = fps
     rows["floor"] = reference_cells(networks.own.card)
-    choices = _choices(command, fake, real)
+    choices = {**_choices(command, fake, real), "resolution": resolution}
     record = {
         "version": __version__,
-        "table": number,
         "checkpoint": None if model is None else dict(model.card),
         "choices": choices,
-        "resolution": resolution,
         "rows": {row: {name: cell._asdict() for name, cell in cells.items()} for row, cells in rows.items()},
         "remarks": remarks(rows),
         "own_network": networks.own.card,
     }
-    return record, table(number, rows, choices, resolution)
+    return record, table(rows, choices)
 
 
 def _model_images(model: DiffusionModel, command: EvaluateGeneration, poses: BodyPose) -> Iterator[TestImage]:
@@ -250,10 +241,10 @@ def _choices(command: EvaluateGeneration, fake: Scores, real: Scores) -> dict[st
         "real pictures": f"{real.pictures}: {command.real or f'{meshes_seeds} in {grid}'}",
         "poses": poses if rendered else "of the pictures",
         "marcher step (m)": MARCH.step if command.fake is None else None,
-        "resize": f"{command.resize}, to {Inception.SIDE} for Inception and {ClipVision.SIDE} for CLIP",
+        "resize": f"as torch-fidelity, to {Inception.SIDE} for Inception and {ClipVision.SIDE} for CLIP",
         "inception": f"pool3, 2048 features, {command.inception}" if command.inception else None,
         "clip": f"image embedding of ViT-B/32, 512 features, {command.clip}" if command.clip else None,
-        "KID": f"{command.kid_subsets} subsets of {command.kid_subset_size}, seed {command.kid_seed}, cubic kernel",
+        "KID": f"{command.kid_subsets} subsets of {command.kid_subset_size}, seed {KID_SEED}, cubic kernel",
         "PCKh": f"within {PCK_SHARE} of the distance {HEAD[0]}-{HEAD[1]} in the picture, occluded joints included; "
         f"{', '.join(JOINTS)}",
         "depth error": "inverted depths inside the human, means and standard deviations aligned, mean squared "

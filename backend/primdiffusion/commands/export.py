@@ -13,8 +13,9 @@ from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
-from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb, write_proxy_obj
-from primdiffusion.files.whole_files import staged
+from primdiffusion.export.merged_file import grid_writer, upright_grid
+from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb
+from primdiffusion.files.whole_files import staged, written_whole
 from primdiffusion.formats.answers import GaussiansAnswer, ProxyAnswer
 from primdiffusion.formats.requests import GaussiansRequest, ProxyRequest
 from primdiffusion.human import Human, place_on_floor, place_skinned
@@ -71,12 +72,16 @@ def export(command: ExportCommand, session: Session, report: ReportProgress) -> 
     """Write a file of the format that its extension names."""
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
+    ending, write_grid = command.out.suffix.lower(), grid_writer(command.out)
     human = load_human(command.human)
-    if command.out.suffix.lower() == ".ply":
-        pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
-        write_gaussians(command.out, gaussians_of(place_on_floor(human, pose), command.gaussians))
-    elif command.out.suffix.lower() == ".glb":
+    if ending == ".glb":
         write_proxy_glb(command.out, mesh_proxy(human, command), human.provenance)
+        return command.out
+    pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
+    placed = place_on_floor(human, pose)
+    if ending == ".ply":
+        write_gaussians(command.out, gaussians_of(placed, command.gaussians))
     else:
-        write_proxy_obj(command.out, mesh_proxy(human, command))
+        with written_whole(command.out) as path:
+            write_grid(path, upright_grid(placed, command.voxel))
     return command.out

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +19,7 @@ from primdiffusion.diffusion.checkpoint import file_hash
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.files.tensor_file import under
-from primdiffusion.files.whole_files import replacing, write_atomically
+from primdiffusion.files.whole_files import replacing
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
@@ -47,7 +45,7 @@ def read_released(path: Path) -> tuple[dict[str, Tensor], Inventory]:
 
 
 def import_released(command: ImportReleasedCommand, session: Session, report: ReportProgress) -> None:
-    """Import, and print a report on every group of tensors. Raises ValueError, FileNotFoundError, OSError."""
+    """Import, and print what became of every group of tensors. Raises ValueError, FileNotFoundError, OSError."""
     weights, inventory = read_released(command.checkpoint)
     print(inventory.account.table())
     if not 1 <= len(command.uv) <= 2:
@@ -69,9 +67,6 @@ def import_released(command: ImportReleasedCommand, session: Session, report: Re
             out = all_or_none.enter_context(replacing(command.out))
             write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, command.chain, card)
         write_encoder(all_or_none.enter_context(replacing(encoder_out)), encoder, body_setup, reference, encoder_card)
-        if command.report is not None:
-            described = all_or_none.enter_context(replacing(command.report))
-            _write_report(described, inventory, card, notes, body_setup)
     print(*notes, *files, sep="\n")
 
 
@@ -124,17 +119,3 @@ def _card(
         "licence": "that of the authors' weights, and of SMPL for what is made on its body",
         "limits": ["needs the SMPL file it was imported with"],
     }
-
-
-def _write_report(
-    path: Path, inventory: Inventory, card: Mapping[str, Any], notes: list[str], body_setup: BodySetup
-) -> None:
-    content = {
-        "card": card,
-        "body": dataclasses.asdict(body_setup.files),
-        "unet": None if inventory.unet is None else dataclasses.asdict(inventory.unet),
-        "notes": notes,
-        "groups": inventory.account.groups(),
-        "tensors": [dataclasses.asdict(entry) for entry in inventory.account.entries],
-    }
-    write_atomically(path, json.dumps(content, indent=1))

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from primdiffusion.formats.requests import (
+    VOXEL,
     Count,
     GaussiansRequest,
     GenerateRequest,
     InpaintRequest,
     InterpolateRequest,
     Making,
-    MergeRequest,
     Person,
     Pixels,
     PoseOptions,
@@ -24,26 +24,30 @@ from primdiffusion.formats.requests import (
     Seed,
     TransferRequest,
     VaryRequest,
+    Voxel,
 )
 from primdiffusion.formats.schema import Ending, FieldError, Option, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportCommand(ProxySettings, PoseOptions):
-    """Export a human to other programs; the extension of --out selects the format: .glb, .obj or .ply."""
+    """Export a human to other programs; the extension of --out selects the format: .glb, .ply, .vdb or .npz."""
 
     human: Person
     """A .human file (or .human.safetensors)."""
-    out: Annotated[Path, Ending((".glb", ".obj", ".ply"))]
-    """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png; .ply: 3D Gaussians."""
+    out: Annotated[Path, Ending((".glb", ".ply", ".vdb", ".npz"))]
+    """.glb: textured mesh with a skeleton; .ply: 3D Gaussians; .vdb: grids density and Cd (needs Python's module
+    openvdb); .npz: such a grid as density, colour, origin, voxel. Grids have z up."""
     gaussians: Count = GaussiansRequest.limit
     """Largest number of Gaussians; about 130,000 of a human are visible."""
+    voxel: Voxel = VOXEL
+    """Voxel size of grids, metres; half the size shows more detail at eight times the memory."""
 
     def check(self) -> None:
-        """Raise FieldError for a pose of a format that stores none, and as `PoseOptions`."""
+        """Raise FieldError for a pose of a mesh, which has a skeleton, and as `PoseOptions`."""
         super().check()
-        if self.pose is not None and self.out.suffix.lower() != ".ply":
-            raise FieldError(("pose",), f"cannot be stored in {self.out.name}: omit it, or export Gaussians to a .ply")
+        if self.pose is not None and self.out.suffix.lower() == ".glb":
+            raise FieldError(("pose",), f"cannot be stored in {self.out.name}: omit it, or export a .ply, .vdb or .npz")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -103,7 +107,7 @@ class PeopleCommand(MadePeople):
     """Make dressed, rigged humans as glTF files, from which captures are rendered."""
 
     out: Path
-    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
+    """Folder to write person_NNNNNN/person.glb and person.json into; complete ones are skipped."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -178,8 +182,6 @@ class ImportReleasedCommand:
     default is the mean body in the T pose, which differs by millimetres."""
     chain: Literal["released", "trailing"] = "released"
     """Timesteps of samplers: 991, 981, ... 1 as in the released code, or from the last step of the schedule."""
-    report: Path | None = None
-    """Output .json with a report on every tensor."""
 
 
 OPTIONS: dict[str, type] = {
@@ -192,7 +194,6 @@ OPTIONS: dict[str, type] = {
     "refine": RefineCommand,
     "render": RenderRequest,
     "export": ExportCommand,
-    "merge": MergeRequest,
     "info": InfoCommand,
     "people": PeopleCommand,
     "payloads": PayloadsCommand,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from pathlib import Path
 
@@ -20,14 +19,14 @@ from primdiffusion.formats.answers import DrawAnswer, RenderAnswer
 from primdiffusion.formats.requests import DrawRequest, RenderRequest
 from primdiffusion.human import body_of, framing, place
 from primdiffusion.human_file import load_human
-from primdiffusion.render.image import depth_to_png, rgba_to_png
-from primdiffusion.render.march import RELEASED, MarchSettings, march
+from primdiffusion.render.image import rgba_to_png
+from primdiffusion.render.march import MarchSettings
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
 
 def render(request: RenderRequest, session: Session, report: ReportProgress) -> RenderAnswer:
-    """Render, and return the paths. Raises as load_human and read_pose, and OSError."""
+    """Render, and return the path. Raises as load_human and read_pose, and OSError."""
     began = time.perf_counter()
     report("load", 0, 1, None)
     human, pose, given = load_human(request.human), None, request.pose
@@ -40,19 +39,15 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     camera, background = framing(primitives, request.yaw_degrees, width, height), BACKGROUNDS[request.background]
     report("render", 0, 1, None)
     if request.compositing == "released":
-        settings = RELEASED
         rgba = decoded(march_encoded(primitives, camera), background)
     else:
-        settings = MarchSettings(step=request.step)
         scene = Scene(primitives, chart=body_of(human)[1].chart)
-        rgba = torch.from_numpy(draw_scene(scene, camera, ViewSettings(request.view, settings=settings)).rgba)
+        look = ViewSettings(request.view, settings=MarchSettings(step=request.step))
+        rgba = torch.from_numpy(draw_scene(scene, camera, look).rgba)
     report("write", 1, 1, 0.0)
-    with contextlib.ExitStack() as files:  # both files or none
-        rgba_to_png(files.enter_context(written_whole(request.out)), rgba, background)
-        if request.depth is not None:
-            rendering = march(primitives, camera, settings)
-            depth_to_png(files.enter_context(written_whole(request.depth)), rendering.depth, rendering.alpha)
-    return RenderAnswer(out=request.out, depth=request.depth, seconds=round(time.perf_counter() - began, 3))
+    with written_whole(request.out) as file:
+        rgba_to_png(file, rgba, background)
+    return RenderAnswer(out=request.out, seconds=round(time.perf_counter() - began, 3))
 
 
 def draw(request: DrawRequest, session: Session, report: ReportProgress) -> DrawAnswer:

@@ -34,7 +34,6 @@ from primdiffusion.formats.schema import Open, Range, read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup
-from primdiffusion.primitives.primitives import K
 
 FORMAT = "primdiffusion-checkpoint"
 RELEASED = "released"
@@ -70,13 +69,15 @@ class ModelConfig(Open):
     """The user's body of a released model, as JSON (`BodyFiles.to_json`)."""
 
     def denoiser(self) -> DenoiserConfig:
-        """Return the sizes of a PersonDenoiser; files older than `end_kernel` have one of 3. Raises FieldError."""
-        local = self.config.get("local")
-        return read(DenoiserConfig, {**self.config, "local": local and {"end_kernel": 3, **local}})
+        """Return the sizes of a PersonDenoiser. Raises FieldError."""
+        return read(DenoiserConfig, self.config)
 
     def unet(self) -> UNetConfig:
-        """Return the sizes of a U-Net; files older than `attention_context` have "input". Raises FieldError."""
-        return read(UNetConfig, {"attention_context": "input", **self.config})
+        """Return the sizes of a U-Net. Raises FieldError."""
+        config = dict(self.config)
+        if config.get("attention_context") == "tokens":  # earlier files name the only choice that is left
+            del config["attention_context"]
+        return read(UNetConfig, config)
 
 
 def default_checkpoint() -> Path:
@@ -225,7 +226,8 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
         denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(config.unet()), weights)
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
-        codec = CellCodec(_linear_codec(under(tensors, "codec.")))
+        stored = under(tensors, "codec.")
+        codec = CellCodec(LinearCodec(**{**stored, "region": stored["region"].long()}))
         check_codec(codec.codec)
         restore_prior(weights, codec.codec)
         prior = PersonPrior(**under(weights, "prior_"))
@@ -236,14 +238,6 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
     chain = CHAINS[config.chain]
     density = float(config.full_density)
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
-
-
-def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:
-    """A codec; files older than `region` have one basis for all primitives."""
-    if "region" not in tensors:
-        one = {key: tensors[key][None] for key in ("basis", "parity")}
-        tensors = {**tensors, **one, "region": torch.zeros(K)}
-    return LinearCodec(**{**tensors, "region": tensors["region"].long()})
 
 
 def _released_model(

@@ -7,7 +7,6 @@ The names and shapes are those of the released checkpoints' `diffusion.*` keys, 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -34,9 +33,6 @@ class UNetConfig:
     its configuration meant, 129,996,856 parameters."""
     heads: int = 8
     """Attention heads of every transformer."""
-    attention_context: Literal["tokens", "input"] = "tokens"
-    """Input of the second attention of a transformer block: the block's own input tokens, as in the released code
-    (SPEC 3); or the transformer's raw input, as in runs of the first versions of this package."""
 
 
 PAPER = UNetConfig()
@@ -113,7 +109,7 @@ class FeedForward(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention, attention on a context (its own input if None), feed-forward, each normalised first and added."""
+    """Self-attention, attention on the block's own input, feed-forward, each normalised first and added (SPEC 3)."""
 
     def __init__(self, channels: int, heads: int):
         super().__init__()
@@ -124,11 +120,9 @@ class TransformerBlock(nn.Module):
         )
         self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(channels) for _ in range(3))
 
-    def forward(
-        self, x: Float[Tensor, "b n c"], context: Float[Tensor, "b m c"] | None = None
-    ) -> Float[Tensor, "b n c"]:
+    def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
         """The transformed tokens."""
-        normalised, context = self.norm1(x), x if context is None else context
+        normalised, context = self.norm1(x), x
         x = x + self.attn1(normalised, normalised)
         x = x + self.attn2(self.norm2(x), context)
         return x + self.ff(self.norm3(x))
@@ -139,7 +133,6 @@ class SpatialTransformer(nn.Module):
 
     def __init__(self, channels: int, config: UNetConfig):
         super().__init__()
-        self.reads_input = config.attention_context == "input"
         self.norm = nn.GroupNorm(32, channels, eps=1e-6)
         self.proj_in = nn.Conv2d(channels, channels, 1)
         self.transformer_blocks = nn.ModuleList([TransformerBlock(channels, config.heads)])
@@ -148,9 +141,8 @@ class SpatialTransformer(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The input plus what attention adds."""
         tokens = self.proj_in(self.norm(x)).flatten(2).transpose(1, 2)
-        context = x.flatten(2).transpose(1, 2) if self.reads_input else None
         for block in self.transformer_blocks:
-            tokens = block(tokens, context)
+            tokens = block(tokens)
         return x + self.proj_out(tokens.transpose(1, 2).unflatten(-1, x.shape[2:]))
 
 

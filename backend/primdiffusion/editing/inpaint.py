@@ -33,11 +33,8 @@ from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
 from primdiffusion.runtime.device import on_fixed_threads
 
-JUMP = 1
-"""Steps of each jump back to a higher noise level. Lugmayr et al. jump 10 of 250 steps; with a few dozen longer steps,
-jumps of one fit best for the same number of denoiser calls (tests/backend/editing)."""
 RESAMPLES = 2
-"""Number of times that each jump's steps are sampled; 1 disables resampling."""
+"""Number of times that each step but the last is sampled; 1 disables resampling."""
 
 
 def repaint(
@@ -48,31 +45,27 @@ def repaint(
     inside: Bool[Tensor, "h w"],
     steps: Sequence[int],
     generator: torch.Generator,
-    jump: int = JUMP,
     resamples: int = RESAMPLES,
 ) -> Iterator[SamplerStep]:
     """Sample the region `inside` along the descending `steps`, conditioned on the clean latent `known` outside.
 
     At every level t the outside is q_sample(known, t) with fresh noise (SPEC 3); inside, a step samples the posterior
-    (paper eq. 6-7). A single step fits the inside to an outside of a higher noise level; after every `jump` steps,
-    noise of `jump` steps is added to both and these steps are repeated (their alg. 1), so that both come to agree. Only
-    the inside of `x`, a latent at steps[0], is used. The last x0 equals `known` outside.
+    (paper eq. 6-7). A single step fits the inside to an outside of a higher noise level; so after a step its noise is
+    added to both again and it is repeated (their alg. 1, with jumps of one step: Lugmayr et al. jump 10 of 250, but
+    with a few dozen longer steps these fit best for the same number of calls). Only the inside of `x`, a latent at
+    steps[0], is used. The last x0 equals `known` outside.
     """
-    levels = (*steps, CLEAN)
-    moves = list(pairwise(resampling_path(len(steps), jump, resamples)))
-    total, done = sum(there > here for here, there in moves), 0
-    x = torch.where(inside, x, noised(schedule, known, levels[0], generator))
-    for t, t_next in ((levels[here], levels[there]) for here, there in moves):
-        if t_next > t:
-            x = renoised(schedule, x, t, t_next, generator)
-            continue
+    moves = [move for move in pairwise(steps) for _ in range(resamples)] + [(steps[-1], CLEAN)]
+    x = torch.where(inside, x, noised(schedule, known, steps[0], generator))
+    for index, (t, t_next) in enumerate(moves):
+        if index and moves[index - 1] == (t, t_next):
+            x = renoised(schedule, x, t_next, t, generator)
         x0 = torch.where(inside, denoise(x, t), known)
         x = schedule.posterior_mean(x, x0, t, t_next)
         if t_next != CLEAN:
             x = x + schedule.posterior_std(t, t_next) * gaussian_noise(x, generator)
         x = torch.where(inside, x, noised(schedule, known, t_next, generator))
-        yield SamplerStep(done, total, t, x0, x)
-        done += 1
+        yield SamplerStep(index, len(moves), t, x0, x)
 
 
 def paste_after_steps(
@@ -95,21 +88,6 @@ def paste_after_steps(
         x = ddpm_step(schedule, x, x0, t, t_next, generator)
         x = torch.where(inside, x, noised(schedule, known, t, generator))
         yield SamplerStep(index, len(steps), t, torch.where(inside, x0, known), x)
-
-
-def resampling_path(count: int, jump: int, resamples: int) -> list[int]:
-    """Positions 0 (noisiest) to `count` (clean) in order, including jumps back.
-
-    Raises ValueError for `jump` or `resamples` below 1.
-    """
-    if jump < 1 or resamples < 1:
-        raise ValueError(f"jump is {jump}, resamples {resamples}: choose 1 or more for both")
-    path = [0]
-    for bottom in range(jump, count, jump):
-        path += range(path[-1] + 1, bottom + 1)
-        for _ in range(resamples - 1):
-            path += range(bottom - jump, bottom + 1)
-    return [*path, *range(path[-1] + 1, count + 1)]
 
 
 def noised(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: torch.Generator) -> Tensor:

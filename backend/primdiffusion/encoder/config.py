@@ -175,17 +175,13 @@ def encoder_config(preset: Preset, ablation: Ablation | None = None) -> EncoderC
     return config
 
 
-_ADDED: Mapping[str, Any] = {"masks": "whole", "compat": "none", "grid_outputs": 0, "thickness": "constant"}
-"""Settings that older files lack, with the values that these files imply."""
-
-
 def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
     """Restore a configuration from the JSON form of `dataclasses.asdict`.
 
     Raises:
         ValueError: settings are unknown to this version, missing or invalid.
     """
-    tree, names = {**_ADDED, **tree}, {field.name for field in dataclasses.fields(EncoderConfig)}
+    names = {field.name for field in dataclasses.fields(EncoderConfig)}
     if set(tree) != names:
         differing = ", ".join(sorted(set(tree) ^ names))
         raise ValueError(f"the encoder's configuration differs in {differing}: use the release that trained it")

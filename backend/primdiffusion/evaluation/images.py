@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +16,6 @@ from torch.nn import functional
 
 from primdiffusion.body.model import BodyPose, PosedBody, default_body
 from primdiffusion.capture.coco import JOINTS
-from primdiffusion.files.arrays import read_npy
-from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
@@ -39,15 +36,11 @@ SIDE = 512
 """Width and height of a picture, pixels."""
 MARGIN = 1.08
 """Radius of the view over that of the sphere around the body."""
-FAR_OUTSIDE = 100
-"""Widths of the picture that no joint is away from its corner."""
 WHITE_DISTANCE = 6
 """Pictures without alpha: a pixel whose channels are all within this of white (255) is background."""
 SUPERSAMPLE = 2
 """Samples along a pixel's side in renders of meshes."""
 SUFFIXES, FORMATS = (".png", ".jpg", ".jpeg", ".webp"), ("PNG", "JPEG", "WEBP")
-JOINTS_FILE = "joints.json"
-DEPTH_FOLDER = "depth"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,14 +146,9 @@ def _with_truth(
 ) -> TestImage:
     depth = torch.where(image.mask, depth, torch.inf)
     pixels, _ = camera.project(joints[:, :3, 3])
-    return dataclasses.replace(image, depth=depth, **_known_joints(pixels))
-
-
-def _known_joints(pixels: Float[Tensor, "24 2"]) -> dict[str, Any]:
-    """The fields `joints` and `head_size` of a picture, from SMPL's joints in its pixels."""
     neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
     own = pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]]
-    return {"joints": own, "head_size": float((neck - head).norm())}
+    return dataclasses.replace(image, depth=depth, joints=own, head_size=float((neck - head).norm()))
 
 
 def folder_pictures(folder: Path) -> list[Path]:
@@ -172,34 +160,24 @@ def folder_pictures(folder: Path) -> list[Path]:
 
 
 def folder_images(folder: Path) -> Iterator[TestImage]:
-    """The pictures of a folder, resized to 512 x 512 and composited over white.
+    """The pictures of a folder, resized to 512 x 512 and composited over white; their joints and depth are unknown.
 
-    `joints.json`, if there, maps a picture's name to the pixels of SMPL's 24 joints [24, 2], and `depth/NAME.npy` is
-    its depth in metres along the optical axis (inf or 0: background), of the picture's size.
-    Raises ValueError for an empty folder, pictures that are not square or unreadable, and truth that does not fit.
+    Raises ValueError for an empty folder, and pictures that are not square or unreadable.
     """
-    paths = folder_pictures(folder)
-    with as_file_error(folder / JOINTS_FILE, "is damaged", "write it again"):
-        truth = read_json(folder / JOINTS_FILE) if (folder / JOINTS_FILE).is_file() else {}
-    if not isinstance(truth, dict):
-        raise ValueError(f"{folder / JOINTS_FILE} is not an object of picture names: see docs/design/evaluation.md")
-    for path in paths:
-        shrunk, size, has_alpha = _read_picture(path)
+    for path in folder_pictures(folder):
+        shrunk, has_alpha = _read_picture(path)
         rgb = shrunk[..., :3]
         alpha = shrunk[..., 3] if has_alpha else (rgb * 255 < 255 - WHITE_DISTANCE).any(-1).float()
-        joints = _joints(truth.get(path.name), size, folder / JOINTS_FILE, path.name)
-        depth = _depth(folder / DEPTH_FOLDER / f"{path.stem}.npy", size)
-        yield TestImage(path.name, rgb, alpha, depth=depth, **joints)
+        yield TestImage(path.name, rgb, alpha)
 
 
-def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], int, bool]:
-    """Colour over white and alpha, resized to SIDE; the picture's own side; whether any of it is transparent."""
+def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], bool]:
+    """Colour over white and alpha, resized to SIDE; whether any of it is transparent."""
     damaged = as_file_error(path, "is not a readable picture", "write it again or remove it", OSError)
     with damaged, opened_picture(path, FORMATS) as picture:
         width, height = picture.size
         if width == height:
-            shrunk, has_alpha = _over_white(picture)
-            return shrunk, width, has_alpha
+            return _over_white(picture)
     raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
 
 
@@ -216,26 +194,3 @@ def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Ten
     if values.shape[:2] == size:
         return values
     return functional.interpolate(values.movedim(-1, 0)[None], size, mode="bicubic", antialias=True)[0].movedim(0, -1)
-
-
-def _joints(given: Any, size: int, source: Path, name: str) -> dict[str, Any]:
-    if given is None:
-        return {}
-    with as_file_error(source, f"has joints of {name} that are not numbers", "give 24 rows x, y"):
-        pixels = torch.tensor(given, dtype=torch.float32) * (SIDE / size)
-    if pixels.shape != (len(JOINT_NAMES), 2) or not torch.isfinite(pixels).all():
-        raise ValueError(f"{source}: the joints of {name} have shape {tuple(pixels.shape)}: give 24 finite rows x, y")
-    if pixels.abs().max() > FAR_OUTSIDE * SIDE:
-        raise ValueError(f"{source}: joints of {name} are not in its picture or near it: give them in pixels")
-    return _known_joints(pixels)
-
-
-def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
-    if not path.is_file():
-        return None
-    with as_file_error(path, "holds no depth", "write it again"):
-        depth = torch.from_numpy(np.asarray(read_npy(path), np.float32))
-    if depth.shape != (size, size):
-        raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
-    depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)
-    return depth if size == SIDE else functional.interpolate(depth[None, None], (SIDE, SIDE), mode="nearest")[0, 0]

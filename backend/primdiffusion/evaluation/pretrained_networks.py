@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -150,19 +149,10 @@ def load_matching(network: nn.Module, weights: Mapping[str, Tensor], what: str, 
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
 
 
-Resize = Literal["torch-fidelity", "antialiased"]
-"""Ways to resize pictures for a network: bilinear between the two nearest pixels from the corner of each, as
-TensorFlow 1 and torch-fidelity do, or bicubic with antialiasing, as CLIP and clean-fid do."""
-
-
-def resized(pictures: Float[Tensor, "n h w 3"], side: int, resize: Resize) -> Float[Tensor, "n 3 side side"]:
-    """Pictures of side x side pixels. Raises ValueError for an unknown `resize`."""
+def resized(pictures: Float[Tensor, "n h w 3"], side: int) -> Float[Tensor, "n 3 side side"]:
+    """Pictures of side x side pixels, bilinear between the two nearest pixels from the corner of each, as TensorFlow 1
+    and torch-fidelity resize them."""
     x = pictures.movedim(-1, 1)
-    if resize == "antialiased":
-        moved = functional.interpolate(x, (side, side), mode="bicubic", align_corners=False, antialias=True)
-        return moved.clamp(0, 1)
-    if resize != "torch-fidelity":
-        raise ValueError(f"unknown resize {resize!r}: choose torch-fidelity or antialiased")
     for dimension in (2, 3):
         position = torch.arange(side, device=x.device) * (x.shape[dimension] / side)
         low = position.long()
@@ -243,14 +233,13 @@ class Inception(nn.Module):
     """Inception-V3 as FID uses it, 2048 features (Szegedy et al. 2016, Heusel et al. 2017).
 
     Matches pt_inception-2015-12-05-6726825d.pth, the file behind published FIDs. Weights are random until
-    `load_inception` fills them. Features equal torch-fidelity's on bytes if `resize` is "torch-fidelity".
+    `load_inception` fills them. Features equal torch-fidelity's on bytes.
     """
 
     SIDE = 299
 
-    def __init__(self, resize: Resize = "torch-fidelity") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.resize: Resize = resize
         self.Conv2d_1a_3x3, self.Conv2d_2a_3x3 = NormalisedConvolution(3, 32, 3, 2), NormalisedConvolution(32, 32, 3)
         self.Conv2d_2b_3x3 = NormalisedConvolution(32, 64, 3, padding=1)
         self.Conv2d_3b_1x1, self.Conv2d_4a_3x3 = NormalisedConvolution(64, 80, 1), NormalisedConvolution(80, 192, 3)
@@ -281,7 +270,7 @@ class Inception(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 2048"]:
         """Features of sRGB-encoded pictures in [0, 1]."""
-        x = (255 * resized(pictures, self.SIDE, self.resize) - 128) / 128  # of bytes, as in the TensorFlow graph
+        x = (255 * resized(pictures, self.SIDE) - 128) / 128  # of bytes, as in the TensorFlow graph
         x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
         x = self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(functional.max_pool2d(x, 3, 2)))
         x = functional.max_pool2d(x, 3, 2)
@@ -290,9 +279,9 @@ class Inception(nn.Module):
         return x.mean((2, 3))
 
 
-def load_inception(path: Path | str, resize: Resize = "torch-fidelity") -> Inception:
+def load_inception(path: Path | str) -> Inception:
     """Load the encoder from a weights file. Raises FileNotFoundError and FileError."""
-    network = Inception(resize)
+    network = Inception()
     # Older files lack num_batches_tracked, which evaluation mode does not use.
     own = {name: value for name, value in network.state_dict().items() if name.endswith("num_batches_tracked")}
     load_matching(network, {**own, **read_weights(path)}, "Inception-V3 as FID uses it", str(path))
@@ -313,9 +302,8 @@ class ClipVision(nn.Module):
     SIDE, PATCH, WIDTH, LAYERS, HEADS, FEATURES = 224, 32, 768, 12, 12, 512
     MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
-    def __init__(self, resize: Resize = "antialiased") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.resize: Resize = resize
         width = self.WIDTH
         self.conv1 = nn.Conv2d(3, width, self.PATCH, self.PATCH, bias=False)
         self.class_embedding = nn.Parameter(torch.randn(width) / width**0.5)
@@ -330,7 +318,7 @@ class ClipVision(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 512"]:
         """Features of sRGB-encoded square pictures in [0, 1]."""
-        x = resized(pictures, self.SIDE, self.resize)
+        x = resized(pictures, self.SIDE)
         mean, std = (x.new_tensor(values)[:, None, None] for values in (self.MEAN, self.STD))
         patches = self.conv1((x - mean) / std).flatten(2).mT
         first = self.class_embedding.expand(len(x), 1, -1)
@@ -349,7 +337,7 @@ CLIP_NAMES = {
 """Parts of OpenAI's names of layers, and torch's."""
 
 
-def load_clip_vision(path: Path | str, resize: Resize = "antialiased") -> ClipVision:
+def load_clip_vision(path: Path | str) -> ClipVision:
     """Load the encoder from a weights file with OpenAI's names, with or without the text encoder.
 
     OpenAI's own file is a TorchScript program and is not run: save its state_dict() as .safetensors. Raises
@@ -362,6 +350,6 @@ def load_clip_vision(path: Path | str, resize: Resize = "antialiased") -> ClipVi
         for theirs, ours in CLIP_NAMES.items():
             name = name.replace(f".{theirs}.", f".{ours}.")
         weights[name] = value.float()
-    network = ClipVision(resize)
+    network = ClipVision()
     load_matching(network, weights, "CLIP's ViT-B/32", str(path))
     return network

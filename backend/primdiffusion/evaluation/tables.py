@@ -1,4 +1,4 @@
-"""The paper's Tables 1 and 2 of any pictures of humans, beside the measures of our own network (SPEC 7).
+"""The measures of the paper's Tables 1 and 2 of any pictures of humans, beside those of our own network (SPEC 7).
 
 FID, FID_CLIP and KID of published networks need weights that the user names; without them a cell is empty and says
 why. The own network's distance, PCKh and depth error are always there.
@@ -39,6 +39,8 @@ BATCH = 16
 SMALLEST = 8
 """Fewest pictures of each set: fewer fit no Gaussian worth comparing."""
 FRAMES_TIMED = 10
+KID_SEED = 2020
+"""Seed of KID's subsets; torch-fidelity's."""
 DETAIL_FLOOR = 0.05
 """Smallest standard deviation of fine detail among real pictures, as in `attribute_network`."""
 
@@ -123,7 +125,7 @@ def check_counts(fakes: int, reals: int) -> None:
 
 
 def compare_pictures(
-    fake: Scores, real: Scores, kid_subsets: int, kid_subset_size: int, seed: int
+    fake: Scores, real: Scores, kid_subsets: int = 100, kid_subset_size: int = 1000
 ) -> dict[str, dict[str, Cell]]:
     """The cells of the rows "generated" and "real". Raises ValueError for too few pictures, and features with NaN.
 
@@ -140,7 +142,7 @@ def compare_pictures(
         rows[row] = {
             "fid_clip": _frechet(fake, real, "clip", "--clip") if made else compared,
             "fid": _frechet(fake, real, "inception", "--inception") if made else compared,
-            "kid": _kid(fake, real, kid_subsets, kid_subset_size, seed) if made else compared,
+            "kid": _kid(fake, real, kid_subsets, kid_subset_size) if made else compared,
             "fps": Cell(None, reason="pictures of a folder or of meshes have no frame rate"),
             "own_pckh": _mean(result.correct, "joints"),
             "own_depth": _mean(result.depth, "depth"),
@@ -159,7 +161,7 @@ def _distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> Cell
     return Cell(frechet_distance(first, second), note=too_few_samples(len(first), len(second), first.shape[1]))
 
 
-def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell:
+def _kid(fake: Scores, real: Scores, subsets: int, size: int) -> Cell:
     if "inception" not in fake.features:
         return Cell(None, reason="no weights file: name one with --inception")
     if min(fake.pictures, real.pictures) < size:
@@ -168,17 +170,14 @@ def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell
             reason=f"subsets of {size} need as many pictures, there are {fake.pictures} generated and {real.pictures} "
             "real: raise --count or lower --kid-subset-size",
         )
-    found = kernel_distance_of_subsets(fake.features["inception"], real.features["inception"], subsets, size, seed)
+    found = kernel_distance_of_subsets(fake.features["inception"], real.features["inception"], subsets, size, KID_SEED)
     return Cell(100 * found.mean, 100 * found.std)
 
 
 def _mean(values: Sequence[float], truth: str) -> Cell:
     """100 times the mean over pictures with truth, and its standard deviation."""
     if not values:
-        return Cell(
-            None,
-            reason=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them",
-        )
+        return Cell(None, reason=f"the {truth} of pictures of a folder are not known")
     found = 100 * torch.tensor(values, dtype=torch.float64)
     return Cell(float(found.mean()), float(found.std(correction=0)))
 
@@ -233,14 +232,7 @@ COLUMNS = {
     "own_pckh": "own PCKh@0.5",
     "own_depth": "own depth x 100",
 }
-OWN = ("own_distance", "own_pckh", "own_depth")
-OF_TABLE = {
-    1: ("fid_clip", "fid", "kid", "fps", *OWN),
-    2: ("fid_clip", "fid", "kid", *OWN),
-}
 """Columns of the paper's tables, then our own network's."""
-
-
 NETWORK_SCORES = {"own_pckh": 1, "own_depth": -1}
 """Columns that score how well a network reads joints or depth from pictures; 1: higher is better, -1: lower is."""
 
@@ -275,20 +267,15 @@ def reference_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
     return {"own_pckh": Cell(errors["pckh"]), "own_depth": Cell(errors["depth"])}
 
 
-def table(
-    number: int, rows: Mapping[str, Mapping[str, Cell]], choices: Mapping[str, Any], resolution: str | None = None
-) -> str:
+def table(rows: Mapping[str, Mapping[str, Cell]], choices: Mapping[str, Any]) -> str:
     """Format as Markdown: the table, every choice, `remarks`, and a sentence for each empty column of the first row."""
-    columns = OF_TABLE[number]
-    resolutions = {row: [(resolution or "-") if row == "generated" else "-"] if number == 2 else [] for row in rows}
-    texts = [[row, *resolutions[row], *(_text(cells.get(column)) for column in columns)] for row, cells in rows.items()]
-    headings = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
-    lines = [markdown_table(headings, texts)]
+    texts = [[row, *(_text(cells.get(column)) for column in COLUMNS)] for row, cells in rows.items()]
+    lines = [markdown_table(["pictures", *COLUMNS.values()], texts)]
     lines += ["", *(f"{name}: {_plain(value)}" for name, value in choices.items())]
-    said = remarks({row: {name: cells[name] for name in columns if name in cells} for row, cells in rows.items()})
+    said = remarks(rows)
     lines += ["", *said] if said else []
     first = next(iter(rows.values()))
-    missing = {COLUMNS[column]: first[column].reason for column in columns if first[column].value is None}
+    missing = {title: first[column].reason for column, title in COLUMNS.items() if first[column].value is None}
     if missing:
         lines += ["", *(f"{name} is empty: {reason}." for name, reason in missing.items())]
     return "\n".join(lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -45,6 +46,14 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
         "voxel": np.float64(grid.voxel),
     }
     write_deflated(path, arrays)
+
+
+def grid_writer(path: Path) -> Callable[[Path, Merged], None]:
+    """Return the function that writes the format of a file. Raises MissingPackageError for a .vdb without openvdb."""
+    if path.suffix.lower() != ".vdb":
+        return write_grid_npz
+    load_openvdb()
+    return write_grid_vdb
 
 
 def load_openvdb() -> ModuleType:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
-from primdiffusion.files.whole_files import staged, written_whole
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import VOXEL, ProxySettings
 from primdiffusion.geometry.srgb import encode_srgb
@@ -197,25 +197,6 @@ def write_proxy_glb(path: str | Path, proxy: MeshProxy, provenance: Mapping[str,
     proxy = proxy.on_floor()
     with written_whole(path) as unfinished:
         unfinished.write_bytes(glb(proxy.mesh(), proxy.skeleton, {"primdiffusion": dict(provenance)}))
-
-
-def write_proxy_obj(path: str | Path, proxy: MeshProxy) -> None:
-    """Write an .obj, its .mtl and .png, all or none; soles at y = 0; OBJ has no skinning. Raises OSError."""
-    path, proxy = Path(path), proxy.on_floor()
-    name = path.stem
-    normals = vertex_normals(proxy.vertices, proxy.faces)
-    lines = [f"mtllib {name}.mtl", "usemtl person"]
-    lines += ["v {:.6f} {:.6f} {:.6f}".format(*vertex) for vertex in proxy.vertices]
-    lines += ["vt {:.6f} {:.6f}".format(*corner) for corner in proxy.corner_uv.reshape(-1, 2)]
-    lines += ["vn {:.4f} {:.4f} {:.4f}".format(*normal) for normal in normals]
-    coordinate = np.arange(1, proxy.faces.size + 1).reshape(-1, 3)
-    for face, uv in zip((proxy.faces + 1).tolist(), coordinate.tolist(), strict=True):
-        lines.append("f " + " ".join(f"{v}/{t}/{v}" for v, t in zip(face, uv, strict=True)))
-    with staged(path.parent) as folder:
-        (folder / path.name).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-        material = f"newmtl person\nKd 1 1 1\nKs 0 0 0\nmap_Kd {name}.png\n"
-        (folder / f"{name}.mtl").write_text(material, encoding="utf-8", newline="\n")
-        Image.fromarray(proxy.texture).save(folder / f"{name}.png")
 
 
 def write_proxy_arrays(folder: Path, proxy: MeshProxy) -> None:

@@ -17,7 +17,6 @@ _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(?=\.|$)", re.IGNORECASE)
 """Stems of names that are devices in every folder of Windows."""
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _LONGEST_PATH = 4096
 
 
@@ -80,18 +79,7 @@ def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO
     """
     size = check_regular(path).st_size  # before it is opened: to open a device may already do something
     check_size(path, size, limit)
-    if not size:
-        return io.BytesIO()
-    file = open(path, "rb")  # noqa: SIM115  the caller closes it
-    try:
-        opened = os.fstat(file.fileno())  # another file may have taken its name in between
-        if not stat.S_ISREG(opened.st_mode):
-            raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
-        check_size(path, opened.st_size, limit)
-    except BaseException:
-        file.close()
-        raise
-    return file
+    return open(path, "rb") if size else io.BytesIO()
 
 
 def read_regular(path: str | Path, limit: int) -> bytes:
@@ -107,16 +95,6 @@ def check_size(path: str | Path, size: int, limit: int) -> None:
     """Raise FileError where `size` is over `limit`, bytes."""
     if size > limit:
         raise FileError(path, f"is larger than {limit / 2**20:.0f} MB, the most for its kind", "use a smaller file")
-
-
-def is_plain_path(path: str) -> bool:
-    """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
-    return 0 < len(path) <= _LONGEST_PATH and path.isprintable() and not _REMOTE.match(path)
-
-
-def may_be_written(path: str) -> bool:
-    """Return whether a path of a request may be written to: no server, device, URL or control character."""
-    return not _REMOTE.match(path) and not _CONTROL.search(path)
 
 
 def is_local_path(path: str) -> bool:

@@ -11,17 +11,11 @@ import errno
 import os
 import re
 import secrets
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from .regular_files import check_inside, open_to_append, remove_file, remove_folder
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
+from .regular_files import check_inside, remove_file, remove_folder
 
 ABANDONED_AFTER_S = 86_400.0
 """Age of a temporary file, seconds, from which its writer counts as ended."""
@@ -146,44 +140,18 @@ def staged(folder: str | Path) -> Iterator[Path]:
 def publish(made: Path, folder: Path) -> None:
     """Move the content of a folder into another of the same disk: files replace files, and folders folders.
 
-    Of two processes one waits for the other, so that files of two results do not mix. Raises OSError;
-    IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.
+    Raises OSError; IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.
     """
-    with _alone_in(folder):
-        pieces = [(path, folder / path.name) for path in sorted(made.iterdir())]
-        for path, target in pieces:
-            if target.exists() and target.is_dir() != path.is_dir():
-                what = "a folder" if target.is_dir() else "not a folder"
-                number = errno.EISDIR if target.is_dir() else errno.ENOTDIR  # OSError becomes the class of its number
-                raise OSError(number, f"this is {what} and will not be replaced", str(target))
-        for path, target in pieces:
-            if target.is_dir():
-                remove_folder(target, folder)
-            os.replace(path, target)
-
-
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Wait until no other process publishes in a folder, which lasts as long as a few files take to be renamed.
-
-    The system ends the wait when that process ends. Nothing stays in the folder. A disk without locks lets all in.
-    """
-    if sys.platform == "win32":
-        lock = folder / ".publishing"
-        with open_to_append(lock) as file:
-            with contextlib.suppress(OSError):
-                msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # waits for ten seconds
-            yield
-        with contextlib.suppress(OSError):  # the next process has it open
-            remove_file(lock, folder)
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+    pieces = [(path, folder / path.name) for path in sorted(made.iterdir())]
+    for path, target in pieces:
+        if target.exists() and target.is_dir() != path.is_dir():
+            what = "a folder" if target.is_dir() else "not a folder"
+            number = errno.EISDIR if target.is_dir() else errno.ENOTDIR  # OSError becomes the class of its number
+            raise OSError(number, f"this is {what} and will not be replaced", str(target))
+    for path, target in pieces:
+        if target.is_dir():
+            remove_folder(target, folder)
+        os.replace(path, target)
 
 
 def _create_folders(folder: Path) -> list[Path]:

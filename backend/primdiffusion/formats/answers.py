@@ -116,7 +116,6 @@ class RenderAnswer(Open):
 
     out: Path | None = None
     seconds: Seconds | None = None
-    depth: Path | None = None
 
     def __str__(self) -> str:
         """As the command line prints it."""
@@ -136,21 +135,8 @@ class DrawAnswer(Open):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MergeAnswer(Open):
-    """A grid of merged humans: density float16 [X, Y, Z] (1/m), colour float16 [X, Y, Z, 3] (linear), origin [3] (the
+    """A grid for each frame: density float16 [X, Y, Z] (1/m), colour float16 [X, Y, Z, 3] (linear), origin [3] (the
     centre of the first voxel), voxel; z up."""
-
-    out: Path
-    seconds: Seconds
-    shape: list[Count] | None = None
-
-    def __str__(self) -> str:
-        """As the command line prints it."""
-        return str(self.out)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeFramesAnswer(Open):
-    """A grid for each frame."""
 
     files: list[Path]
     seconds: Seconds
@@ -278,7 +264,6 @@ ANSWERS: dict[str, type] = {
     "render": RenderAnswer,
     "draw": DrawAnswer,
     "merge": MergeAnswer,
-    "merge_frames": MergeFramesAnswer,
     "proxy": ProxyAnswer,
     "gaussians": GaussiansAnswer,
     "cancel": CancelAnswer,

@@ -3,7 +3,7 @@
     root/dataset.json                              what the captures are: settings, axes, passes, names of parts
     root/release_human_list.txt                    one subject a line
     root/annotations.json                          COCO annotations: `captures coco`
-    root/composed/{id}/img/cameraNNNN/FFFF.jpg     of it: over backgrounds, or of several humans
+    root/composed/{id}/img/cameraNNNN/FFFF.jpg     of it: of several humans
     root/{id}/img/cameraNNNN/FFFF.jpg              sRGB over the background
     root/{id}/mask/cameraNNNN/FFFF.png             8 bits: share of the pixel that the person covers
     root/{id}/depth/cameraNNNN/FFFF.png            16 bits, in units of 0.25 mm along the optical axis; 0: nothing

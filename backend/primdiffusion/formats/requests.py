@@ -9,7 +9,6 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from ..files.regular_files import real_path
 from .joints import JOINT_NAMES
 from .schema import Ending, FieldError, Length, Option, Range, Shape, Slider
 
@@ -252,7 +251,7 @@ class Pictures:
     """A mask for each picture, of its size: opaque or white where the person is. Pictures with alpha need none,
     nor does a single picture with a posture of its own camera, which cuts the person out (extra cutout) to mask.png."""
     mask_label: Annotated[int, Range(0, 65535)] | None = None
-    """The person's label in masks of more than two: the index in their palette, or else the grey value."""
+    """The person's label in masks of labels: the index in their palette, or else the grey value."""
     pose: Path | None = None
     """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl, .bvh), or a posture.json; without
     it, the person is taken to stand upright, facing the camera."""
@@ -359,14 +358,10 @@ class RenderRequest(PoseOptions):
     millimetre, rays through pixel corners."""
     background: Literal["black", "white", "transparent"] = "black"
     """Background behind the human."""
-    depth: Annotated[Path, Ending((".png",))] | None = None
-    """A second PNG: depth in false colours, bright where near."""
 
     def check(self) -> None:
-        """Raise FieldError for one file with two contents, for what `released` does not have, as `PoseOptions`."""
+        """Raise FieldError for what `released` does not have, and as `PoseOptions`."""
         super().check()
-        if self.depth is not None and real_path(self.depth) == real_path(self.out):
-            raise FieldError(("depth",), f"is {self.depth}, as out: give two different files")
         if self.compositing == "released" and (self.view, self.step) != ("colour", RAY_STEP):
             raise FieldError(
                 ("compositing",), "is released, which has its own step and the view colour: omit the others"
@@ -443,39 +438,15 @@ class DrawRequest:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeRequest(PoseOptions):
-    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
-
-    humans: Annotated[tuple[Path, ...], Option(positional=True)] = ()
-    """.human files (or .human.safetensors), side by side."""
-    people: Annotated[list[PosedPerson], Option(hidden=True)] = dataclasses.field(default_factory=list)
-    """Instead of `humans`."""
-    out: Annotated[Path, Ending((".vdb", ".npz"))]
-    """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
-    voxel: Voxel = VOXEL
-    """Voxel size, metres; half the size shows more detail at eight times the memory."""
-    apart: float = 1.0
-    """Distance between neighbours, side by side, metres."""
-
-    def check(self) -> None:
-        """Raise FieldError unless humans are given in exactly one way, and as `PoseOptions`."""
-        super().check()
-        if not self.humans and not self.people:
-            raise FieldError(("humans",), "is empty: give at least one")
-        if self.humans and self.people:
-            raise FieldError(("humans",), "and people exclude each other: give files, or humans posed by armatures")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeFramesRequest:
-    """Write a grid for each frame of a human. Needs no checkpoint."""
+class MergeRequest:
+    """Write a voxel grid for each frame of a human. Needs no checkpoint."""
 
     people: Annotated[list[PosedPerson], Length(1)]
     """The same human, once for each frame."""
     out_dir: Path
     """Output folder of 0000.npz, 0001.npz, ...; created if missing."""
     voxel: Voxel = VOXEL
-    """Voxel size, metres."""
+    """Voxel size, metres; half the size shows more detail at eight times the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -553,7 +524,6 @@ REQUESTS: dict[str, type] = {
     "render": RenderRequest,
     "draw": DrawRequest,
     "merge": MergeRequest,
-    "merge_frames": MergeFramesRequest,
     "proxy": ProxyRequest,
     "gaussians": GaussiansRequest,
     "cancel": CancelRequest,

@@ -8,7 +8,6 @@ all, and for what a decoded picture takes, UNBACKED_BYTES or LARGEST_RATIO times
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import struct
 import warnings
@@ -30,8 +29,6 @@ UNBACKED_BYTES = 160 * 2**20
 LARGEST_RATIO = 160
 """Decoded bytes for each byte of the file beyond that. A scan's texture of 8192 x 8192 then needs a file of 1.7 MB; as
 JPEG it has 1.0 MB if all of it has one colour."""
-MOST_SCANS = 64
-"""Scans of a JPEG, each of which passes over all of its pixels; progressive files have about ten."""
 LARGEST_FILE = 512 * 2**20
 """Bytes of a picture file."""
 _UNREADABLE = (
@@ -63,8 +60,6 @@ def opened_picture(
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limits below are smaller
                 with Image.open(file, formats=formats) as picture:
                     check_pixels(picture.width, picture.height, size, bytes_each)
-                    if picture.format == "JPEG":
-                        _check_scans(file)
                     yield picture
         except FileError:
             raise
@@ -105,15 +100,3 @@ def label_values(picture: Image.Image) -> np.ndarray:
     if picture.mode.startswith("I"):
         return np.asarray(picture).astype(np.uint16)
     return decoded(picture, "P" if is_indexed(picture) else "L")
-
-
-def _check_scans(file: BinaryIO | io.BufferedReader | io.BytesIO) -> None:
-    """Count the markers that begin scans, which no compressed data contain."""
-    place, scans, last = file.tell(), 0, b""
-    file.seek(0)
-    while chunk := file.read(2**20):
-        scans += (last + chunk).count(b"\xff\xda")
-        last = chunk[-1:]
-    file.seek(place)
-    if scans > MOST_SCANS:
-        raise ValueError(f"{scans} scans, more than {MOST_SCANS}")

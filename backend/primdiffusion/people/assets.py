@@ -53,12 +53,6 @@ class Assets:
             )
         return _decoded(path, size)
 
-    def files(self, name: str) -> tuple[str, ...]:
-        """Relative paths of an asset's files: mesh, proxy and textures."""
-        meshes = [f"{name}{ending}" for ending in (".mhclo", ".obj") if (self.root / f"{name}{ending}").is_file()]
-        pictures = [_picture_path(self.root, f"{name}{ending}") for ending in ("", "_diffuse", "_ao")]
-        return (*meshes, *(path.relative_to(self.root).as_posix() for path in pictures if path))
-
     def pictures(self, folder: str, contains: str = "") -> tuple[str, ...]:
         """Names (without extension, sorted) of the images in a folder whose file name contains a word."""
         found = {

@@ -1,8 +1,7 @@
 """Write humans as a folder of rigged glTF files, from which captures are rendered.
 
-    manifest.json                    seed, count, people, and every asset used; written last
     person_NNNNNN/person.glb         NNNNNN is the seed
-    person_NNNNNN/person.json        seed, betas, attributes, asset files
+    person_NNNNNN/person.json        seed, betas, attributes
 
 Each folder is written atomically, so that an interrupted run can be resumed.
 """
@@ -23,7 +22,7 @@ import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import remove_folder
-from primdiffusion.files.whole_files import remove_abandoned, temporary_name, write_atomically
+from primdiffusion.files.whole_files import remove_abandoned, temporary_name
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import Count, Seed, check_seed
 from primdiffusion.formats.schema import Checked
@@ -33,8 +32,7 @@ from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.people.person import Person, make_person
 from primdiffusion.runtime.worker_process import each
 
-FORMAT, VERSION = "primdiffusion-people", 1
-MANIFEST, GLB, CARD = "manifest.json", "person.glb", "person.json"
+GLB, CARD = "person.glb", "person.json"
 BODY = "default"
 JOINT_GRID = 2.0**20
 """Joints are rounded to 1 / JOINT_GRID m, so that files do not depend on the order of summation."""
@@ -70,7 +68,7 @@ def name_of(seed: int) -> str:
 
 
 def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int]:
-    """Write missing samples, then the manifest; yields the number of finished ones, starting with the existing.
+    """Write missing samples; yields the number of finished ones, starting with the existing.
 
     A sample takes about one second on one core. Files are deterministic for a seed, whatever the number of workers.
 
@@ -91,18 +89,13 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
     for _ in each(write_person, jobs, max(1, min(workers, len(jobs)))):
         done += 1
         yield done
-    _write_manifest(people)
 
 
 def write_person(assets: Assets, folder: Path, seed: int) -> None:
     """Generate one sample and write its folder, atomically; an existing folder is replaced."""
     person = make_person(assets, load_base_mesh(), seed)
     binary = glb(person.mesh, skeleton_of(person), {"primdiffusion": _identity(person, seed)})
-    card = {
-        **_identity(person, seed),
-        "attributes": person.attributes,
-        "sources": [{"path": path} for path in person.sources],
-    }
+    card = {**_identity(person, seed), "attributes": person.attributes}
     partial = temporary_name(folder)
     try:
         partial.mkdir()
@@ -129,7 +122,10 @@ def skeleton_of(person: Person) -> Skeleton:
 
 def is_there(folder: Path, seed: int) -> bool:
     """Whether a folder contains this sample: folders appear whole or not at all."""
-    return (_read_card(folder) or {}).get("seed") == seed
+    with contextlib.suppress(OSError, ValueError):
+        card = read_json(folder / CARD)
+        return isinstance(card, dict) and card.get("seed") == seed
+    return False
 
 
 def _identity(person: Person, seed: int) -> dict[str, Any]:
@@ -137,45 +133,12 @@ def _identity(person: Person, seed: int) -> dict[str, Any]:
 
 
 def _check_folder(people: PeopleSet) -> None:
-    """Raise ValueError if the folder has another first seed or samples outside the range."""
-    remedy = "choose another folder, or give the same --seed and at least the same --count"
-    requested = f"{people.count} from seed {people.seed} were requested"
-    manifest = _read_json(people.root / MANIFEST)
-    if manifest is not None and manifest.get("seed") != people.seed:
-        raise ValueError(
-            f"{people.root} contains {manifest.get('count')} samples from seed {manifest.get('seed')}, "
-            f"but {requested}: {remedy}"
-        )
+    """Raise ValueError if the folder has samples outside the range."""
     expected = {name_of(seed) for seed in people.seeds}
     found = [path.name for path in people.root.glob("person_*") if PERSON.fullmatch(path.name)]
     unexpected = sorted(set(found) - expected)
     if unexpected:
         raise ValueError(
-            f"{people.root} contains {unexpected[0]} ({len(unexpected)} out of range), but {requested}: {remedy}"
+            f"{people.root} contains {unexpected[0]} ({len(unexpected)} out of range), but {people.count} from seed "
+            f"{people.seed} were requested: choose another folder, or a range with all that it contains"
         )
-
-
-def _write_manifest(people: PeopleSet) -> None:
-    cards = [_read_card(people.folder(seed)) or {} for seed in people.seeds]
-    used = sorted({source["path"] for card in cards for source in card.get("sources", ())})
-    manifest = {
-        "format": FORMAT,
-        "version": VERSION,
-        "seed": people.seed,
-        "count": people.count,
-        "assets": [{"path": path} for path in used],
-        "people": [name_of(seed) for seed in people.seeds],
-    }
-    write_atomically(people.root / MANIFEST, json.dumps(manifest, indent=1) + "\n")
-
-
-def _read_card(folder: Path) -> dict[str, Any] | None:
-    return _read_json(folder / CARD)
-
-
-def _read_json(path: Path) -> dict[str, Any] | None:
-    """Read a JSON object; None if the file is missing or damaged."""
-    with contextlib.suppress(OSError, ValueError):
-        value = read_json(path)
-        return value if isinstance(value, dict) else None
-    return None

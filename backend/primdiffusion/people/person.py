@@ -44,8 +44,6 @@ class Person:
     betas: Float[np.ndarray, "10"]
     attributes: dict[str, str | float]
     """Labels such as sex, skin tone, garments and colours."""
-    sources: tuple[str, ...]
-    """Asset files that were used, as relative paths."""
     choice: Choice
     assets: Assets
     base: BaseMesh
@@ -173,9 +171,4 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
         "eyes": iris,
         "height": round(float(mesh.parts[0].vertices[:, 1].max() - mesh.bounds[0, 1]), 4),
     }
-    used = (
-        choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, EYES, complexion.base,
-        complexion.other, appearance.picture_of(iris), choice.hair and hair_path(choice.hair), choice.hat,
-    )  # fmt: skip
-    sources = tuple(dict.fromkeys(file for name in used if name for file in assets.files(name)))
-    return Person(TexturedMesh(parts), choice.betas, attributes, sources, choice, assets, base)
+    return Person(TexturedMesh(parts), choice.betas, attributes, choice, assets, base)

@@ -18,7 +18,7 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel
 from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.regular_files import FileError, check_regular, is_plain_path, open_regular, real_path
+from primdiffusion.files.regular_files import FileError, check_regular, is_local_path, open_regular, real_path
 from primdiffusion.formats.schema import read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
@@ -88,13 +88,7 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     """
     folders, wanted = tuple(beside), (files.smpl, *files.uv)
     paths = [_found(file, folders) for file in wanted]
-    key = tuple((file.sha256, path.suffix) for file, path in zip(wanted, paths, strict=True))
-    body_setup = _loaded.pop(key, None)
-    if body_setup is None:
-        body_setup = body_setup_from_files(paths[0], tuple(paths[1:]))
-    _loaded[key] = body_setup
-    while len(_loaded) > _KEPT:
-        del _loaded[next(iter(_loaded))]
+    body_setup = _body_setup(tuple(paths), tuple(file.sha256 for file in wanted))
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
         raise ValueError(f"the stored rest extents are not {K} x 3 positive")
     return dataclasses.replace(
@@ -102,16 +96,17 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     )
 
 
-_KEPT = 2
-_loaded: dict[tuple[tuple[str, str], ...], BodySetup] = {}
-"""Bodies that were loaded, by the hashes and endings of their files, the last used last."""
+@functools.lru_cache(maxsize=2)
+def _body_setup(paths: tuple[Path, ...], hashes: tuple[str, ...]) -> BodySetup:
+    """Load the body of files with these hashes."""
+    return body_setup_from_files(paths[0], paths[1:])
 
 
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
     shown, name = f"{file.path!r:.120}".strip("'"), PureWindowsPath(file.path).name  # also parses POSIX paths
-    named = [Path(file.path)] if is_plain_path(file.path) else []
+    named = [Path(file.path)] if is_local_path(file.path) else []
     problem = "is missing" if named else "is not named by a path on this machine"
-    for path in (*named, *(folder / name for folder in folders if name and is_plain_path(name))):
+    for path in (*named, *(folder / name for folder in folders if name)):
         try:
             status = check_regular(path)
             digest = _known_sha256(path, status.st_mtime_ns, status.st_size)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from primdiffusion.commands import FUNCTIONS, function_of
 from primdiffusion.files.json_files import LARGEST_BYTES, parse_message
-from primdiffusion.files.regular_files import may_be_written, printable
+from primdiffusion.files.regular_files import printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import FieldError, read, written
@@ -49,8 +49,6 @@ PROTOCOL = 1
 HEARTBEAT_S = 0.5
 LONGEST_LINE = LARGEST_BYTES + 2
 """Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
-OUTPUTS = ("out_dir", "out", "depth", "frame")
-"""Fields of requests that are files and folders to write."""
 GRACE_S = 3.0
 """Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""
 
@@ -312,12 +310,7 @@ class Server:
 def _parameters(message: RpcRequest) -> Any:
     """Read the parameters of a message. Raises RpcError(INVALID_PARAMS)."""
     try:
-        request = read(REQUESTS[message.method], message.params, message.method)
-        for name in OUTPUTS:
-            path = getattr(request, name, None)
-            if path is not None and not may_be_written(str(path)):
-                raise FieldError((message.method, name), f"is {str(path)!r:.80}: give a path on this computer")
-        return request
+        return read(REQUESTS[message.method], message.params, message.method)
     except FieldError as e:
         raise RpcError(INVALID_PARAMS, printable(shortened(str(e)))) from e
 

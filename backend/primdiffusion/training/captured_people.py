@@ -130,7 +130,7 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
     cards = {}
     for name, path in find_people(people).items():
         card = path.parent / CARD
-        if path.name != f"{name}.glb" and card.is_file():
+        if card.is_file():
             with as_file_error(card, "is damaged", "make the human again"):
                 cards[name] = dict(read_json(card))
     return cards

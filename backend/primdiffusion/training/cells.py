@@ -180,9 +180,7 @@ class CellTask(DiffusionTask):
 
     def loss(self, step: Step) -> Mapping[str, Tensor]:
         """Weighted x0 error of a random batch at random levels."""
-        loss = self.objective(step.phase).loss(step.generator)
-        step.timer.lap("forward")
-        return {"loss": loss}
+        return {"loss": self.objective(step.phase).loss(step.generator)}
 
     def objective(self, phase: str) -> PersonObjective | RestObjective:
         """Return the objective of a network."""

@@ -16,9 +16,8 @@ from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.requests import Count, NotNegative, Positive, Share
 from primdiffusion.formats.schema import Checked, Range
 
-Weighting = Literal["whitened", "plain", "min_snr"]
 Tracker = Literal["tensorboard", "wandb"]
-Levels = Literal["uniform", "log_uniform", "log_normal"]
+Levels = Literal["uniform", "log_normal"]
 Decay = Annotated[float, Range(0, 0.999999)]
 
 
@@ -91,20 +90,9 @@ class PhaseConfig(OptimiserSettings):
     optimiser: Literal["adamw", "muon"] = "adamw"
     """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
     default preset, and computes in bfloat16: devices without instructions for it take AdamW."""
-    weighting: Weighting = "whitened"
-    """Weighting of x0 errors: whitened, in units of the posterior std of the closed form; plain, as in the paper;
-    min_snr, plain times min(SNR, gamma) (Hang et al. 2023)."""
-    error_power: NotNegative = 1.0
-    """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
     levels: Levels = "uniform"
-    """Distribution of noise levels: uniform in t, as in the paper; log_uniform in noise over signal; log_normal in the
-    same (Karras et al. 2022), with a fifth log_uniform."""
-    level_median: Positive = 2.0
-    """Median of log_normal levels: noise over signal, in units of the samples' standard deviation."""
-    level_width: Positive = 1.4
-    """Standard deviation of the logarithm of log_normal levels."""
-    min_snr_gamma: Positive = 5.0
-    """Largest weight of a level with min_snr."""
+    """Distribution of noise levels: uniform in t, as in the paper; log_normal in noise over signal, near the spread of
+    what is denoised (Karras et al. 2022), with a fifth of all levels evenly in its logarithm."""
     blend: Share = 0.3
     """Fraction of samples that blend the colour variants of one geometry. Default preset only."""
     unasked: Share = 0.5
@@ -179,8 +167,8 @@ class TrainingConfig(RunSettings):
     """Size of the paper preset's network."""
     slab: PhaseConfig = dataclasses.field(
         default_factory=lambda: PhaseConfig(
-            steps=200_000, batch=8, learning_rate=1e-5, weight_decay=0.0, ema=0.9999, weighting="plain",
-            evaluate_every=5000, bfloat16=True,
+            steps=200_000, batch=8, learning_rate=1e-5, weight_decay=0.0, ema=0.9999, evaluate_every=5000,
+            bfloat16=True,
         )
     )  # fmt: skip
     """The only phase of the paper preset; the batch is that of each process."""
@@ -192,8 +180,6 @@ class TrainingConfig(RunSettings):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
         super().__post_init__()
-        if self.preset == "paper" and self.slab.weighting == "whitened":
-            raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
         if self.preset == "paper" and self.slab.optimiser == "muon":
             raise ValueError("slab.optimiser is muon, which is for the default preset: choose adamw")
         for name in ("start_from", "more_data"):
@@ -229,18 +215,11 @@ MAY_CHANGE = frozenset(
 learning rate's cosine."""
 
 
-_ADDED = {"unet.attention_context": "input", "slab.optimiser": "adamw"}
-"""Settings of the paper preset that earlier runs do not name, and what they were."""
-
-
 def check_resumable(saved: str, config: RunSettings) -> None:
     """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
     with as_file_error(config.run, "has damaged settings", "give a new folder"):
         before = _comparable(parse_json(saved))
     now = _comparable(parse_json(to_json(config)))
-    for name, value in _ADDED.items():
-        if name in now and name not in before:
-            before[name] = value if before.get("preset") == "paper" else now[name]
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
         differing = ", ".join(f"{key:.30} ({before.get(key)!s:.20}, not {now.get(key)!s:.20})" for key in changed[:2])

@@ -113,7 +113,6 @@ def _card(
         "steps": {name: state.step for name, state in states.items()},
         "seconds": {name: round(state.seconds, 1) for name, state in states.items()},
         "batch": {name: task.phases[name].batch * processes for name in states},
-        "weighting": {name: task.phases[name].weighting for name in states},
         "parameters": sum(p.numel() for state in states.values() for p in state.network.parameters()),
     }
     if config.start_from is not None:

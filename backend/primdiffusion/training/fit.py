@@ -30,7 +30,7 @@ from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
 from primdiffusion.training.fit_voxels import fit_missing, voxel_loss
-from primdiffusion.training.loop import Step, StepTimer, Task, train
+from primdiffusion.training.loop import Step, Task, train
 from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.state import TrainingState, adamw
 from primdiffusion.version import __version__
@@ -132,11 +132,9 @@ class EncoderTask(Task):
             self._batches = fit_batches(self.dataset, self.config, start, share)
         sample, position = next(self._batches)
         step.place["position"] = json.dumps(list(position))
-        sample = sample.to(self.accelerator.device)
-        step.timer.lap("data")
-        return self.terms(sample, step.number, step.timer)
+        return self.terms(sample.to(self.accelerator.device), step.number)
 
-    def terms(self, sample: FitSample, number: int, timer: StepTimer) -> Mapping[str, Tensor]:
+    def terms(self, sample: FitSample, number: int) -> Mapping[str, Tensor]:
         """Return the weighted terms for a batch, after `number` steps."""
         config = self.config
         with self.accelerator.autocast():
@@ -146,7 +144,6 @@ class EncoderTask(Task):
         if number < config.hold_scale or sample.fitted is not None:
             # Multiplied by zero, because distributed training needs a gradient of every parameter.
             payload = dataclasses.replace(payload, delta_scale=sample.found.extent + 0 * payload.delta_scale)
-        timer.lap("forward")
         if sample.fitted is not None:
             fitted = voxel_loss(payload, sample.fitted, config.architecture.full_density)
             terms["voxels"] = config.loss.voxels * fitted + 0 * payload.delta_scale.sum()
@@ -159,7 +156,6 @@ class EncoderTask(Task):
         terms |= loss_terms(
             encode_srgb(picture.rgb), picture.alpha, primitives.half_extent, target, mask, config.loss, self.perceptual
         )
-        timer.lap("march")
         return terms
 
     def held_out(self) -> Mapping[str, float]:

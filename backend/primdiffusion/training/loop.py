@@ -44,24 +44,6 @@ IMPATIENT = 2.0
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class StepTimer:
-    """Measures seconds between laps, synchronising the device."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device, self.seconds = device, {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """End a lap."""
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        elif self.device.type == "mps":
-            torch.mps.synchronize()
-        now = time.perf_counter()
-        self.seconds[name] = now - self._last
-        self._last = now
-
-
 @dataclasses.dataclass(frozen=True)
 class Step:
     """One optimiser step, as its loss sees it."""
@@ -73,7 +55,6 @@ class Step:
     """Random numbers on the device that depend on seed, phase, step and process only, as torch's own do in a step."""
     place: dict[str, str]
     """State of the task in this phase, saved and restored with the network."""
-    timer: StepTimer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,8 +65,7 @@ class StepMetrics:
     """Weighted terms of the objective on the batch of this process."""
     gradient: float
     """Norm of the gradient before clipping."""
-    seconds: Mapping[str, float]
-    """Times of the parts of a step; the last includes the update."""
+    seconds: float
 
 
 class Task(ABC):
@@ -187,10 +167,10 @@ def take_step(task: Task, phase: str, seed: int, state: TrainingState) -> StepMe
     device = state.accelerator.device
     seed = step_seed(seed, phase, state.step, state.accelerator.process_index)
     torch.manual_seed(seed)
-    generator, timer = torch.Generator(device).manual_seed(seed), StepTimer(device)
+    generator, began = torch.Generator(device).manual_seed(seed), time.perf_counter()
     state.prepared.train()
     with _memory_named(task, phase):
-        terms = task.loss(Step(phase, state.step, generator, state.place, timer))
+        terms = task.loss(Step(phase, state.step, generator, state.place))
         values = {name: float(term.detach()) for name, term in terms.items()}
         if bad := [name for name, value in values.items() if not math.isfinite(value)]:
             which = f"of {phase!r}" if phase else f"({', '.join(bad)})"
@@ -199,8 +179,7 @@ def take_step(task: Task, phase: str, seed: int, state: TrainingState) -> StepMe
                 "new run folder"
             )
         gradient = state.update(torch.stack(list(terms.values())).sum())
-    timer.lap("backward")
-    return StepMetrics(values, gradient, timer.seconds)
+    return StepMetrics(values, gradient, time.perf_counter() - began)
 
 
 def step_seed(seed: int, phase: str, step: int, process: int) -> int:
@@ -256,8 +235,7 @@ class Recorder:
     def __call__(self, progress: StepMetrics) -> None:
         """Record a step. Raises OSError if the disk is full."""
         step = self.state.step
-        row = {**progress.terms, "gradient": progress.gradient}
-        row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}
+        row = {**progress.terms, "gradient": progress.gradient, "seconds_step": progress.seconds}
         for name, value in row.items():
             before = self.means.get(name, value)
             self.means[name] = before + (value - before) / min(step, MEMORY)
@@ -286,7 +264,7 @@ class Recorder:
 
     def _write(self, values: Mapping[str, float]) -> None:
         step, steps = self.state.step, self.settings.steps
-        left = (steps - step) * sum(value for name, value in self.means.items() if name.startswith("seconds_"))
+        left = (steps - step) * self.means["seconds_step"]
         shown = " ".join(f"{name}={value:.4g}" for name, value in values.items())
         of = f"{self.phase}, " if self.phase else ""
         log.info("%sstep %d of %d, %s left: %s", of, step, steps, tqdm.format_interval(left), shown)

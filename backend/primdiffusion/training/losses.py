@@ -1,4 +1,4 @@
-"""Objectives of the default denoiser's two networks, weightings of errors, and the evaluation error.
+"""Objectives of the default denoiser's two networks, and the evaluation error.
 
 Random numbers are drawn on the device of their generator, which must be that of the samples.
 """
@@ -23,39 +23,23 @@ from primdiffusion.training.latents import LatentSet
 
 LEVELS = (50, 100, 300, 500, 700, 900)
 """Steps at which held-out error is reported."""
+LEVEL_MEDIAN, LEVEL_WIDTH = 2.0, 1.4
+"""Of log-normal levels: median of noise over signal, in units of the samples' standard deviation, and standard
+deviation of its logarithm."""
 LOG_UNIFORM_SHARE = 0.2
 """Share of log-uniform levels among log-normal ones: no level stays untrained."""
 BLURRED_FROM = 300
 """Step above which noise (1.2 of the signal and more) hides that people are blurred (by .03 in latents)."""
 
 
-def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power: float) -> Tensor:
-    """Mean square of `error`, given in units of `std`, weighted by std^power; every level's weights have mean 1.
+def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> Tensor:
+    """Mean square of `error`, given in units of the closed form's posterior std, weighted by that std.
 
-    power 2 is the paper's unweighted x0 error (eq. 9) divided by the error of the closed form at the same level.
+    Every level's weights have mean 1. The square of std would give the paper's x0 error (eq. 9), which the highest
+    levels dominate.
     """
-    weight = std if power == 1 else std**power
-    return (weight / weight.mean(1, keepdim=True) * error.square()).mean()
-
-
-def level_weight(signal: Tensor, noise: Tensor, config: PhaseConfig) -> Tensor:
-    """Weight of the plain x0 error at a level: 1, or with min_snr min(SNR, gamma) (Hang et al. 2023, for x0)."""
-    if config.weighting == "min_snr":
-        return (signal / noise).square().clamp(max=config.min_snr_gamma)
-    return torch.ones_like(signal)
-
-
-def objective(
-    error: Float[Tensor, "b *s"],
-    std: Float[Tensor, "b *s"],
-    signal: Float[Tensor, "b *1"],
-    noise: Float[Tensor, "b *1"],
-    config: PhaseConfig,
-) -> Tensor:
-    """Mean of x0 errors as the settings weight them; `std` is the closed form's posterior standard deviation."""
-    if config.weighting == "whitened":
-        return weighted_error((error / std).flatten(1), std.flatten(1), config.error_power)
-    return (level_weight(signal, noise, config) * error.square()).mean()
+    weight = std.flatten(1)
+    return (weight / weight.mean(1, keepdim=True) * error.flatten(1).square()).mean()
 
 
 @dataclasses.dataclass
@@ -84,7 +68,7 @@ class PersonObjective:
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        return objective(self.denoiser.coefficients(y, t, condition) - c, std, signal, noise, self.config)
+        return weighted_error((self.denoiser.coefficients(y, t, condition) - c) / std, std)
 
 
 @dataclasses.dataclass
@@ -112,16 +96,13 @@ class RestObjective:
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
         z[flip] = self.codec.mirror(z[flip])
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
-        signal, noise = self.denoiser.schedule.levels(t, z)
+        signal, _ = self.denoiser.schedule.levels(t, z)
         with torch.no_grad():
             _, clean = self.denoiser.prior.split(z)
             y, rest = self.denoiser.prior.split(x, signal)
             coefficients = self.denoiser.coefficients(y, t, condition)
         guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
-        missing = guess - clean
-        if self.config.weighting == "whitened":
-            return weighted_error((missing / std + correction).flatten(1), std.flatten(1), self.config.error_power)
-        return objective(missing + std * correction, std, signal, noise, self.config)
+        return weighted_error((guess - clean) / std + correction, std)
 
 
 def random_steps(
@@ -138,11 +119,9 @@ def random_steps(
     noise_over_signal = 0.5 * ((1 - alpha_bar).log() - alpha_bar.log())
     low, high = noise_over_signal[0], noise_over_signal[-1]
     uniform, which = torch.rand(2, count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
-    drawn = low + (high - low) * uniform
-    if config.levels == "log_normal":
-        normal = torch.randn(count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
-        about = math.log(config.level_median * spread) + config.level_width * normal
-        drawn = torch.where(which < LOG_UNIFORM_SHARE, drawn, about.clamp(low, high))
+    normal = torch.randn(count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
+    about = math.log(LEVEL_MEDIAN * spread) + LEVEL_WIDTH * normal
+    drawn = torch.where(which < LOG_UNIFORM_SHARE, low + (high - low) * uniform, about.clamp(low, high))
     return torch.searchsorted(noise_over_signal, drawn).clamp_max(schedule.length - 1)
 
 

@@ -14,7 +14,6 @@ import torch
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.files.regular_files import FileError
-from primdiffusion.runtime.failures import MissingPackageError
 from smplx.lbs import lbs
 from support.errors import refused
 
@@ -130,21 +129,9 @@ def test_npz_loads_and_the_default_body_comes_back_whole(tmp_path):
         posedirs=np.zeros((len(body.template), 3, 207), np.float32), weights=body.skin_weights,
         J_regressor=body.joint_regressor, kintree_table=np.stack([parents, np.arange(J)]), vt=body.uv, ft=body.uv_faces,
     )  # fmt: skip
-    loaded = load_body(tmp_path / "body.npz")
+    loaded = load_body(tmp_path / "body.npz", uv=tmp_path / "body.npz")
     for field in dataclasses.fields(body):
         torch.testing.assert_close(getattr(loaded, field.name), getattr(body, field.name), rtol=0, atol=0)
-
-
-def test_without_texture_coordinates_the_body_is_unwrapped(tmp_path):
-    body = load_body(pickled(tmp_path, smpl_arrays()))
-    assert body.uv_faces.shape == body.faces.shape
-    assert 0 <= body.uv.min() < body.uv.max() <= 1
-
-
-def test_without_xatlas_a_body_without_texture_coordinates_is_rejected_with_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "xatlas", None)
-    with refused(MissingPackageError, "uv"):
-        load_body(pickled(tmp_path, smpl_arrays()))
 
 
 def test_obj_texture_coordinates_follow_the_bodys_face_order(tmp_path, uv_pair):
@@ -182,7 +169,7 @@ def test_hostile_pickle_is_rejected_by_name_and_does_not_run(tmp_path, protocol,
     content = {**smpl_arrays(), where: Hostile(pathlib.os.mkdir, str(trace))}
     path = pickled(tmp_path, content, protocol)
     with pytest.raises(FileError, match=r"(posix|nt)\.mkdir"):
-        load_body(path)
+        load_body(path, uv=path)
     assert not trace.exists()
     pickle.loads(path.read_bytes())  # the same bytes do harm where nobody holds them back
     assert trace.exists()
@@ -203,7 +190,7 @@ def test_other_ways_to_reach_code_are_rejected(tmp_path, program):
     path.write_bytes(program)
     assert list(pickletools.genops(program))
     with pytest.raises(FileError):
-        load_body(path)
+        load_body(path, uv=path)
 
 
 def spoiled(name: str, value: object) -> dict[str, object]:
@@ -237,10 +224,10 @@ def test_broken_content_is_named(tmp_path, uv_pair, content, name):
 
 def test_wrong_paths_and_texture_files_are_named(tmp_path, uv_pair):
     with refused(FileNotFoundError, "nowhere.pkl"):
-        load_body(tmp_path / "nowhere.pkl")
+        load_body(tmp_path / "nowhere.pkl", uv=uv_pair)
     (tmp_path / "body.fbx").write_bytes(b"")
     with refused(FileError, ".fbx"):
-        load_body(tmp_path / "body.fbx")
+        load_body(tmp_path / "body.fbx", uv=uv_pair)
     path = pickled(tmp_path, smpl_arrays())
     np.save(tmp_path / "short.npy", np.zeros((F - 1, 3), int))
     with refused(FileError, "116"):

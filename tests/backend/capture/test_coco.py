@@ -12,7 +12,6 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.coco import FACE, KEYPOINTS, keypoints_of, run_lengths, visibility, write_coco
-from primdiffusion.capture.composed import Backgrounds, compose, read_background, uncovered
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
@@ -20,7 +19,6 @@ from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View
 from primdiffusion.formats.joints import JOINT_NAMES
-from scipy import ndimage
 from support.capture_files import faults
 from support.errors import refused
 
@@ -249,62 +247,6 @@ def test_unfinished_subjects_are_left_out(root):
     write_coco(open_captures(root), {})
     assert {one["subject"] for one in annotations(root)["annotations"]} == {NAME}
     assert all(image["subjects"] == [NAME] for image in annotations(root)["images"])
-
-
-@pytest.fixture
-def backgrounds(tmp_path):
-    """Pictures of one colour each, of other proportions than the views."""
-    paths = []
-    for name, colour in (("green.png", (0, 200, 0)), ("grey.jpg", (90, 90, 90))):
-        paths.append(tmp_path / "backgrounds" / name)
-        paths[-1].parent.mkdir(exist_ok=True)
-        Image.new("RGB", (70, 40), colour).save(paths[-1], quality=100)
-    return paths
-
-
-def test_backgrounds_fill_what_the_human_leaves_and_the_seed_draws_them(root, backgrounds):
-    command = ["captures", "coco", str(root), "--backgrounds", str(backgrounds[0].parent), "--seed"]
-    cli.main([*command, "3"])
-    subject, drawn = open_captures(root).subject(NAME), []
-    for image in annotations(root)["images"][:12]:
-        stored = subject.rgba(image["frame"], image["camera"]).astype(int)
-        with Image.open(root / image["file_name"]) as picture:
-            shown = np.asarray(picture).astype(int)
-        empty, full = stored[..., 3] == 0, ndimage.binary_erosion(stored[..., 3] == 255, iterations=8)
-        colour = np.median(shown[empty], axis=0)
-        drawn.append("green" if abs(colour - (0, 200, 0)).max() < 3 else "grey")
-        assert abs(colour - ((0, 200, 0) if drawn[-1] == "green" else (90, 90, 90))).max() < 3
-        assert abs(shown - stored[..., :3])[full].max(initial=0) < 8
-    assert set(drawn) == {"green", "grey"}
-    first = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
-    cli.main([*command, "3"])
-    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == first
-    cli.main([*command, "4"])
-    assert {path for path in root.rglob("*") if path.is_file()} == set(first)
-    assert any(path.read_bytes() != content for path, content in first.items())
-    assert not faults(root)
-
-
-def test_half_covered_pixels_mix_in_linear_light():
-    image, mask = np.array([[[0, 0, 0], [188, 0, 0], [255, 255, 255]]], np.uint8), np.array([[0, 128, 255]], np.uint8)
-    shares = uncovered([mask], [np.full((1, 3), 4000, np.uint16)], [1.0])
-    mixed = compose([image], shares, np.full((1, 3, 3), 255, np.uint8))
-    assert mixed.tolist() == [[[255, 255, 255], [255, 187, 187], [255, 255, 255]]]
-
-
-def test_a_background_is_cut_to_the_proportions_of_the_view(tmp_path):
-    stripes = np.zeros((10, 40, 3), np.uint8)
-    stripes[:, 15:25] = 255
-    Image.fromarray(stripes).save(tmp_path / "stripes.png")
-    assert (read_background(tmp_path / "stripes.png", 10, 10) == 255).all()
-    assert read_background(tmp_path / "stripes.png", 80, 20).shape == (20, 80, 3)
-
-
-def test_a_damaged_background_is_named_and_no_annotation_is_written(root, backgrounds):
-    backgrounds[1].write_bytes(b"no picture")
-    with refused(FileError, "grey.jpg"):
-        write_coco(open_captures(root), {}, Backgrounds(tuple(backgrounds)))
-    assert not any((root / name).exists() for name in WRITTEN)
 
 
 @pytest.mark.parametrize("kind", ["depth", "mask", "img"])

@@ -10,7 +10,7 @@ from capture_scenes import decoded, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.coco import KEYPOINTS, groups, write_coco
-from primdiffusion.capture.composed import Backgrounds, compose, drawn_box, uncovered
+from primdiffusion.capture.composed import compose, drawn_box, uncovered
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import built_in_poses, turned
 from primdiffusion.capture.reader import open_captures
@@ -150,10 +150,9 @@ def test_nearer_layers_cover_farther_ones_whatever_their_order():
     depths = [np.array([[4000, 0]], np.uint16), np.array([[8000, 8000]], np.uint16)]
     half = 127 / 255
     shares, turned = uncovered(masks, depths, [1.0, 2.0]), uncovered(masks[::-1], depths[::-1], [2.0, 1.0])
-    assert np.allclose(shares, [[[1, 1]], [[0, half]], [[0, 0]]])
-    assert np.allclose(turned, [[[0, half]], [[1, 1]], [[0, 0]]])
-    behind = np.full((1, 2, 3), 255, np.uint8)
-    image, same = compose(images, shares, behind), compose(images[::-1], turned, behind)
+    assert np.allclose(shares, [[[1, 1]], [[0, half]]])
+    assert np.allclose(turned, [[[0, half]], [[1, 1]]])
+    image, same = compose(images, shares), compose(images[::-1], turned)
     assert np.array_equal(image, same)
     assert image[0, 0].tolist() == [128] * 3
     assert decode_srgb(image[0, 1] / 255) == pytest.approx(float(decode_srgb(np.array(128 / 255))) + half, abs=0.004)
@@ -180,29 +179,26 @@ def test_shares_and_images_are_those_of_sorting_all_pixels():
             filled = [np.where(depth > 0, depth * 0.00025, far) for depth, far in zip(depths, distances, strict=True)]
             order = np.stack(filled).argsort(axis=0, kind="stable")
             left = np.take_along_axis(1 - np.stack(masks) / np.float32(255), order, axis=0)
-            left = np.cumprod(np.concatenate([np.ones((1, *left.shape[1:]), np.float32), left]), axis=0)
+            left = np.cumprod(np.concatenate([np.ones((1, *left.shape[1:]), np.float32), left[:-1]]), axis=0)
             expected = left.copy()
-            np.put_along_axis(expected[:-1], order, left[:-1], axis=0)
+            np.put_along_axis(expected, order, left, axis=0)
             shares = uncovered(masks, depths, distances)
             assert np.array_equal(shares, expected)
-            behind = rng.integers(0, 256, (*order.shape[1:], 3)).astype(np.uint8)
-            layers = [*images, behind]
-            linear = sum(share[..., None] * LINEAR_OF_BYTE[layer] for share, layer in zip(shares, layers, strict=True))
-            assert np.array_equal(compose(images, shares, behind), srgb_bytes(np.minimum(linear, 1)))
+            linear = sum(share[..., None] * LINEAR_OF_BYTE[image] for share, image in zip(shares, images, strict=True))
+            assert np.array_equal(compose(images, shares), srgb_bytes(np.minimum(linear, 1)))
 
 
-def test_outside_of_the_box_there_is_only_the_background():
+def test_outside_of_the_box_there_is_nothing():
     rng = np.random.default_rng(9)
     for humans in (1, 3):
         images, masks, depths, distances = random_passes(rng, humans)
         box = drawn_box([*images, *masks])
-        behind = rng.integers(0, 256, (*masks[0].shape, 3)).astype(np.uint8)
-        whole = compose(images, uncovered(masks, depths, distances), behind)
+        whole = compose(images, uncovered(masks, depths, distances))
         shares = uncovered([mask[box] for mask in masks], [depth[box] for depth in depths], distances)
-        assert behind[box].size < behind.size
-        assert np.array_equal(compose([image[box] for image in images], shares, behind[box]), whole[box])
-        behind[box] = whole[box]
-        assert np.array_equal(behind, whole)
+        assert whole[box].size < whole.size
+        assert np.array_equal(compose([image[box] for image in images], shares), whole[box])
+        whole[box] = 0
+        assert not whole.any()
     empty = np.zeros((4, 5), np.uint8)
     assert empty[drawn_box([np.zeros((4, 5, 3), np.uint8), empty])].size == 0
 
@@ -232,17 +228,6 @@ def test_a_picture_of_a_group_that_is_missing_is_rendered_again_to_the_same_byte
     cli.main([*command, "--cameras", "4", "--size", "96", "--together", "3", "--shard", "1/5"])
     after = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     assert all(after[path] == content for path, content in before.items() if "report" not in path.name)
-
-
-def test_backgrounds_go_behind_all_humans(root, tmp_path):
-    Image.new("RGB", (30, 30), (0, 0, 255)).save(tmp_path / "blue.png")
-    write_coco(open_captures(root), {}, Backgrounds((tmp_path / "blue.png",)))
-    image = json.loads((root / "annotations.json").read_text())["images"][5]
-    where = image["frame"], image["camera"]
-    masks = [open_captures(root).subject(name).picture("mask", *where) for name in NAMES[:3]]
-    shown = np.asarray(Image.open(root / image["file_name"])).astype(int)
-    empty = np.max(masks, axis=0) == 0
-    assert np.abs(np.median(shown[empty], axis=0) - (0, 0, 255)).max() < 4
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import open_captures
@@ -160,10 +159,7 @@ def test_no_captures_are_no_captures(tmp_path):
         open_captures(tmp_path)
 
 
-def test_info_and_sheet_say_and_show_what_is_there(root, tmp_path, capsys):
-    cli.main(["captures", "info", str(root)])
-    about = json.loads(capsys.readouterr().out)
-    assert [about[key] for key in ("subjects", "frames", "cameras", "size")] == [2, 3, 4, [32, 32]]
+def test_a_sheet_shows_what_is_there(root, tmp_path):
     draw_sheet(open_captures(root), tmp_path / "sheet.png", rows=6, columns=3, size=64)
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.size == (3 * 64, 6 * 64)

@@ -49,7 +49,7 @@ def line(folder, tmp_path):
             {"edit": "inpaint", "attributes": {"outfit": "suit"}},
         ),
         (
-            ["transfer", "--source", "bob.human.safetensors", "--region", "top"],
+            ["transfer", "--source", "bob.human.safetensors", "--region", "top", "--checkpoint", "none.safetensors"],
             {"edit": "transfer_texture", "region": ["top"]},
         ),
         (

@@ -14,13 +14,11 @@ from primdiffusion.commands import merge as commands
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.merged_file import upright_grid
-from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
-from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
+from primdiffusion.formats.requests import MergeRequest, PosedPerson
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
 from primdiffusion.runtime.failures import MissingPackageError
-from primdiffusion.serve.server import Cancelled
 from tiny_model import tiny_model
 
 VOXEL = 0.03
@@ -47,19 +45,17 @@ def quiet(*_: object, **__: object) -> None:
     """Hears no report."""
 
 
-def done(request: MergeRequest | MergeFramesRequest, report=quiet) -> MergeAnswer | MergeFramesAnswer:
-    run = commands.merge if isinstance(request, MergeRequest) else commands.merge_frames
-    return run(request, Session(), report)
+def done(out_dir: Path, *people: PosedPerson, report=quiet) -> list[Path]:
+    return commands.merge(MergeRequest(people=list(people), out_dir=out_dir, voxel=VOXEL), Session(), report).files
 
 
 def test_a_grid_is_the_posed_person_turned_z_up(human, person, tmp_path):
-    result = done(MergeRequest(people=[person], out=tmp_path / "grid.npz", voxel=VOXEL))
-    with np.load(result.out, allow_pickle=False) as grid:
+    (file,) = done(tmp_path / "grids", person)
+    with np.load(file, allow_pickle=False) as grid:
         density, colour, origin = grid["density"], grid["colour"], grid["origin"]
         assert density.dtype == colour.dtype == np.float16
         assert grid["voxel"] == VOXEL
     expected = merge(place(human, pose(2)), VOXEL)
-    assert list(density.shape) == result.shape
 
     def centre(values: np.ndarray, start: np.ndarray) -> np.ndarray:
         where = np.stack(np.meshgrid(*map(np.arange, values.shape), indexing="ij"), -1)
@@ -74,8 +70,8 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, per
     betas = human.betas + torch.tensor([0.0, 3.0, 1.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0])
     joints = pose_body(betas, pose(2)).skinning[:, :3].tolist()
     wider = dataclasses.replace(person, joints=joints, betas=betas.tolist())
-    result = done(MergeRequest(people=[wider], out=tmp_path / "grid.npz", voxel=VOXEL))
-    with np.load(result.out, allow_pickle=False) as grid:
+    (file,) = done(tmp_path / "grids", wider)
+    with np.load(file, allow_pickle=False) as grid:
         got = grid["density"].sum(dtype=np.float64)
     grown, ungrown = (
         upright_grid(place(one, pose(2)), VOXEL).density.sum(dtype=np.float64)
@@ -88,24 +84,12 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, per
 def test_frames_are_the_person_s_single_grids(human, person, tmp_path):
     other = dataclasses.replace(person, joints=pose_body(human.betas, pose(5)).skinning[:, :3].tolist())
     reports = []
-    request = MergeFramesRequest(people=[person, other], out_dir=tmp_path / "new" / "grids", voxel=VOXEL)
-    result = done(request, lambda *report: reports.append(report))
+    files = done(tmp_path / "new" / "grids", person, other, report=lambda *report: reports.append(report))
     assert [report[:3] for report in reports] == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
-    for file, one in zip(result.files, (person, other), strict=True):
-        alone = done(MergeRequest(people=[one], out=tmp_path / "one.npz", voxel=VOXEL)).out
-        with np.load(file) as grid, np.load(alone) as expected:
-            for name in ("density", "colour", "origin", "voxel"):
-                np.testing.assert_array_equal(grid[name], expected[name])
-
-
-def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
-    def cancelled(_stage, step, *_):
-        if step:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        done(MergeRequest(people=[person], out=tmp_path / "grid.npz", voxel=VOXEL), cancelled)
-    assert not list(tmp_path.glob("*grid*"))
+    (alone,) = done(tmp_path / "alone", other)
+    for name, values in grid_of(alone).items():
+        np.testing.assert_array_equal(grid_of(files[1])[name], values)
+    assert grid_of(files[0])["density"].shape != grid_of(alone)["density"].shape
 
 
 COARSE = ["--voxel", "0.03"]
@@ -134,21 +118,9 @@ def grid_of(path: Path) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
-def test_several_stand_side_by_side(saved, tmp_path):
-    cli.run(["merge", str(saved), str(saved), "--apart", "3", "--out", str(tmp_path / "two.npz"), *COARSE])
-    cli.run(["merge", str(saved), "--out", str(tmp_path / "one.npz"), *COARSE])
-    one, two = (grid_of(tmp_path / f"{name}.npz") for name in ("one", "two"))
-    assert (two["density"].shape[0] - one["density"].shape[0]) * 0.03 == pytest.approx(3, abs=0.07)
-    assert two["origin"][2] == pytest.approx(0, abs=0.2), "the soles are on the floor"
-    middles = [float(grid["origin"][0] + 0.03 * (grid["density"].shape[0] - 1) / 2) for grid in (one, two)]
-    assert middles[1] == pytest.approx(middles[0], abs=0.07), "around the place of one"
-    masses = [grid["density"].sum(dtype=np.float64) for grid in (one, two)]
-    assert masses[1] == pytest.approx(2 * masses[0], rel=0.02)
-
-
 def test_a_vdb_holds_the_same_numbers_where_they_belong(saved, tmp_path, blenders_openvdb):
-    cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.npz"), *COARSE])
-    cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.vdb"), *COARSE])
+    cli.run(["export", str(saved), "--out", str(tmp_path / "anna.npz"), *COARSE])
+    cli.run(["export", str(saved), "--out", str(tmp_path / "anna.vdb"), *COARSE])
     grid = grid_of(tmp_path / "anna.npz")
     stored = {one.name: one for one in blenders_openvdb.readAllGridMetadata(str(tmp_path / "anna.vdb"))}
     assert set(stored) == {"density", "Cd"}
@@ -163,23 +135,20 @@ def test_a_vdb_holds_the_same_numbers_where_they_belong(saved, tmp_path, blender
 def test_without_openvdb_a_vdb_is_rejected_before_any_work(saved, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "openvdb", None)
     with pytest.raises(MissingPackageError, match=r"or write an \.npz"):
-        cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.vdb")])
+        cli.run(["export", str(saved), "--out", str(tmp_path / "anna.vdb")])
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--out", "anna.obj"], r"^out is .*\.vdb or \.npz"),
         (["--out", "nowhere/anna.npz"], "there is no folder"),
         (["--out", "anna.npz", "--voxel", "0"], "^voxel is 0"),
         (["--out", "anna.npz", "--voxel", "0.0001"], "choose .* mm or more"),
-        (["--out", "anna.npz", "--frame", "2"], "^frame is 2"),
-        (["--out", "anna.npz", "--apart", "inf"], "apart is inf"),
     ],
 )
-def test_what_cannot_be_merged_is_rejected_and_leaves_nothing(saved, tmp_path, monkeypatch, more, sentence):
+def test_grids_that_cannot_be_are_rejected_and_leaves_nothing(saved, tmp_path, monkeypatch, more, sentence):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((ValueError, FileNotFoundError), match=sentence):
-        cli.run(["merge", str(saved), *more])
+        cli.run(["export", str(saved), *more])
     assert not list(tmp_path.iterdir())

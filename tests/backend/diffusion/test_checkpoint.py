@@ -142,19 +142,6 @@ def test_a_codec_of_before_weights_is_read_as_it_was(path):
     assert codec.dead_zone.tolist() == pytest.approx(DEAD_ZONE)
 
 
-def test_a_codec_of_before_regions_has_one_basis(path):
-    codec = load_checkpoint(path).codec.codec
-
-    def one_basis(tensors):
-        kept = {k: v[0].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
-        return {k: v for k, v in kept.items() if k != "codec.region"}
-
-    rewrite(path, one_basis)
-    older = load_checkpoint(path).codec.codec
-    latents = torch.randn(1, codec.channels, 32, 32)
-    assert torch.equal(older.decode(latents), codec.decode(latents))
-
-
 def without(tree: str, key: str) -> str:
     return json.dumps({k: v for k, v in json.loads(tree).items() if k != key})
 

@@ -3,27 +3,13 @@
 import pytest
 import torch
 from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
-from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint, resampling_path
-from support.errors import refused
+from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint
 
 SCHEDULE = linear()
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
-
-
-def test_the_path_goes_down_with_every_stretch_sampled_again():
-    assert resampling_path(4, 2, 2) == [0, 1, 2, 0, 1, 2, 3, 4]
-    assert resampling_path(5, 2, 3) == [0, 1, 2, 0, 1, 2, 0, 1, 2, 3, 4, 2, 3, 4, 2, 3, 4, 5]
-    assert resampling_path(3, 5, 2) == [0, 1, 2, 3]
-    assert resampling_path(3, 1, 1) == [0, 1, 2, 3]
-
-
-@pytest.mark.parametrize(("jump", "resamples"), [(0, 2), (2, 0)])
-def test_a_path_of_no_steps_is_rejected(jump, resamples):
-    with refused(ValueError, "1 or more"):
-        resampling_path(4, jump, resamples)
 
 
 @pytest.mark.parametrize("resamples", [1, 2])
@@ -40,7 +26,7 @@ def test_the_denoiser_always_sees_the_outside_with_the_noise_of_the_step_it_is_a
 
     chain = trailing_steps(SCHEDULE.length, 12)
     start = torch.randn(known.shape, generator=generator(2))
-    steps = list(repaint(denoise, SCHEDULE, start, known, inside, chain, generator(3), 4, resamples))
+    steps = list(repaint(denoise, SCHEDULE, start, known, inside, chain, generator(3), resamples))
     assert {t for t, _, _ in seen} == set(chain)
     assert len(seen) == len(steps) == steps[0].total
     for t, mean, std in seen:
@@ -53,7 +39,7 @@ def test_what_a_step_leaves_outside_has_the_noise_of_the_level_it_leads_to():
     inside = torch.zeros(64, 64, dtype=torch.bool)
     inside[0, 0] = True
     chain = trailing_steps(SCHEDULE.length, 5)
-    steps = list(repaint(lambda x, t: x, SCHEDULE, known, known, inside, chain, generator(), 5, 1))
+    steps = list(repaint(lambda x, t: x, SCHEDULE, known, known, inside, chain, generator(), 1))
     for step, t_next in zip(steps, [*chain[1:], CLEAN], strict=True):
         left = (step.x - SCHEDULE.signal(t_next) * known)[..., ~inside]
         assert float(left.std()) == pytest.approx(SCHEDULE.noise(t_next), rel=0.03)
@@ -101,14 +87,14 @@ def correlated(covariance: torch.Tensor):
     return denoise
 
 
-def inside_mean(jump: int, resamples: int) -> float:
+def inside_mean(resamples: int) -> float:
     """Mean of one of a pair when the other is known to be 1.5; their correlation is 0.9."""
     covariance = torch.tensor([[1.0, 0.9], [0.9, 1.0]])
     known = torch.tensor([1.5, 0.0]).expand(20000, 1, 1, 2)
     inside = torch.tensor([[False, True]])
     start, chain = torch.randn(known.shape, generator=generator(4)), trailing_steps(SCHEDULE.length, 30)
     denoise = correlated(covariance)
-    *_, step = repaint(denoise, SCHEDULE, start, known, inside, chain, generator(5), jump, resamples)
+    *_, step = repaint(denoise, SCHEDULE, start, known, inside, chain, generator(5), resamples)
     return float(step.x0[..., 1].mean())
 
 
@@ -123,12 +109,7 @@ def released_inside_mean() -> float:
 
 def test_the_more_often_steps_are_sampled_the_better_the_inside_fits_the_outside():
     fits = 0.9 * 1.5
-    assert fits - released_inside_mean() > fits - inside_mean(1, 2)
-    misses = [fits - inside_mean(1, resamples) for resamples in (1, 2, 5)]
+    assert fits - released_inside_mean() > fits - inside_mean(2)
+    misses = [fits - inside_mean(resamples) for resamples in (1, 2, 5)]
     assert misses[0] > misses[1] > misses[2] > 0
     assert misses[2] < 0.35 * misses[0]
-
-
-def test_short_jumps_fit_better_than_long_ones_with_as_many_calls():
-    """30 steps: jumps of 1 sampled twice are 59 calls, of 5 sampled three times 80."""
-    assert inside_mean(1, 2) > inside_mean(5, 3) + 0.05

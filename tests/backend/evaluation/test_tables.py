@@ -13,7 +13,6 @@ from primdiffusion.evaluation.images import TestImage as Picture
 from primdiffusion.evaluation.pose_depth_network import joint_positions, load_pose_depth_network, shrunk
 from primdiffusion.evaluation.tables import (
     COLUMNS,
-    OF_TABLE,
     Cell,
     Networks,
     Scores,
@@ -59,34 +58,34 @@ def folder(path, count: int, seed: int):
 
 def test_distances_grow_with_the_shift_and_reals_are_compared_with_themselves():
     real = judged(40, 0)
-    near, far = (compare_pictures(judged(40, 1, shift), real, 5, 20, 0)["generated"] for shift in (0.0, 1.0))
+    near, far = (compare_pictures(judged(40, 1, shift), real, 5, 20)["generated"] for shift in (0.0, 1.0))
     for column in ("fid", "fid_clip", "kid", "own_distance"):
         assert near[column].value < far[column].value
-    halves = compare_pictures(judged(40, 1), real, 5, 20, 0)["real"]["own_distance"].value
+    halves = compare_pictures(judged(40, 1), real, 5, 20)["real"]["own_distance"].value
     assert halves == pytest.approx(near["own_distance"].value, rel=0.5)
 
 
 def test_own_distances_are_of_sets_of_one_size():
     """Frechet distances fall with the number of pictures: more generated ones do not lower it."""
-    few, many = (compare_pictures(judged(count, 1), judged(40, 0), 5, 8, 0) for count in (20, 2000))
+    few, many = (compare_pictures(judged(count, 1), judged(40, 0), 5, 8) for count in (20, 2000))
     assert few["generated"]["own_distance"].value == pytest.approx(many["generated"]["own_distance"].value, rel=0.5)
 
 
 def test_a_known_share_of_joints_is_the_pckh():
-    rows = compare_pictures(judged(10, 1, correct=[1.0] * 9 + [0.5]), judged(10, 0), 5, 8, 0)
+    rows = compare_pictures(judged(10, 1, correct=[1.0] * 9 + [0.5]), judged(10, 0), 5, 8)
     assert rows["generated"]["own_pckh"][:2] == pytest.approx((95, 15))
 
 
 def test_empty_columns_say_why():
     fake = judged(10, 1)
     bare = Scores(10, {name: fake.features[name] for name in ("own", "detail")}, fake.correct, fake.depth)
-    cells = compare_pictures(bare, bare, 5, 8, 0)["generated"]
-    assert all(cells[column].value is None for column in OF_TABLE[1] if column != "own_distance")
+    cells = compare_pictures(bare, bare, 5, 8)["generated"]
+    assert all(cells[column].value is None for column in COLUMNS if column != "own_distance")
     assert "--inception" in cells["fid"].reason
     assert "--clip" in cells["fid_clip"].reason
     assert "joints" in cells["own_pckh"].reason
-    assert "100 need" in compare_pictures(fake, fake, 5, 100, 0)["generated"]["kid"].reason
-    text = table(1, {"generated": cells}, {"poses": ["a", "b"], "FPS": None})
+    assert "100 need" in compare_pictures(fake, fake, 5, 100)["generated"]["kid"].reason
+    text = table({"generated": cells}, {"poses": ["a", "b"], "FPS": None})
     assert f"FID is empty: {cells['fid'].reason}." in text
     assert "poses: a, b" in text
 
@@ -106,21 +105,19 @@ def test_scores_that_real_pictures_do_not_win_are_said_not_to_discriminate():
     joints, depth = remarks(rows)
     assert joints.startswith("own PCKh@0.5 does not discriminate: real pictures have 37.92, which ours 49.28 reach or")
     assert depth.startswith("own depth x 100 does not discriminate: real pictures have 150.4, which ours 133.5, voxels")
-    assert joints in table(2, rows | {"ours": rows["ours"] | empty(2)}, {})
+    assert joints in table(rows | {"ours": rows["ours"] | empty()}, {})
     assert remarks({"generated": row(30.0, 160.0), "real": row(37.92, 150.4)}) == []
 
 
-def empty(number: int) -> dict[str, Cell]:
+def empty() -> dict[str, Cell]:
     return {
-        name: Cell(None, reason="it was not asked for")
-        for name in OF_TABLE[number]
-        if name not in ("own_pckh", "own_depth")
+        name: Cell(None, reason="it was not asked for") for name in COLUMNS if name not in ("own_pckh", "own_depth")
     }
 
 
 def test_frechet_distances_of_few_pictures_are_said_to_be_biased():
-    few, many = (compare_pictures(judged(count, 1), judged(2 * count, 0), 5, 8, 0) for count in (79, 90))
-    assert "FID: 79 samples for 8 features are fewer than 10 each (80): the distance is biased" in table(1, few, {})
+    few, many = (compare_pictures(judged(count, 1), judged(2 * count, 0), 5, 8) for count in (79, 90))
+    assert "FID: 79 samples for 8 features are fewer than 10 each (80): the distance is biased" in table(few, {})
     assert [text.partition(":")[0] for text in remarks(few)] == ["FID", "own distance"]
     assert remarks(many) == []
 
@@ -130,14 +127,14 @@ def test_ten_fakes_against_five_reals_are_one_sentence(tmp_path):
         check_counts(10, 5)
     fake, real = folder(tmp_path / "fake", 10, 0), folder(tmp_path / "real", 5, 1)
     with refused(ValueError, "10 generated", "5 real"):
-        command.run(["generation", "--table", "1", "--fake", str(fake), "--real", str(real)])
+        command.run(["generation", "--fake", str(fake), "--real", str(real)])
 
 
 def test_weights_with_nan_are_one_sentence():
     fake = judged(10, 1)
     fake.features["inception"][0, 0] = torch.nan
     with refused(ValueError, "NaN"):
-        compare_pictures(fake, judged(10, 0), 5, 8, 0)
+        compare_pictures(fake, judged(10, 0), 5, 8)
 
 
 def test_joints_are_judged_against_the_truth_of_each_picture():
@@ -158,7 +155,7 @@ def test_joints_are_judged_against_the_truth_of_each_picture():
 def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
     fake, real = folder(tmp_path / "fake", 9, 0), folder(tmp_path / "real", 16, 1)
     for name in ("one", "two"):
-        line = ["generation", "--table", "2", "--fake", str(fake), "--real", str(real), "--kid-subset-size", "4"]
+        line = ["generation", "--fake", str(fake), "--real", str(real), "--kid-subset-size", "4"]
         command.run([*line, "--json", str(tmp_path / f"{name}.json")])
     first, second = ((tmp_path / f"{name}.json").read_bytes() for name in ("one", "two"))
     assert first == second
@@ -167,14 +164,14 @@ def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
     assert record["rows"]["generated"]["own_pckh"]["value"] is None
     assert math.isfinite(record["rows"]["generated"]["own_distance"]["value"])
     printed = capsys.readouterr().out
-    assert "| pictures | resolution | FID_CLIP |" in printed
+    assert "| pictures | FID_CLIP |" in printed
     assert all(f"{name}: " in printed for name in record["choices"])
 
 
 def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "load_checkpoint", lambda path, device: tiny_model())
     real = folder(tmp_path / "real", 8, 1)
-    line = ["generation", "--table", "1", "--real", str(real), "--count", "2", "--poses", "2", "--views", "2"]
+    line = ["generation", "--real", str(real), "--count", "2", "--poses", "2", "--views", "2"]
     records = []
     for name in ("one", "two"):
         command.run([*line, "--steps", "2", "--json", str(tmp_path / f"{name}.json")])
@@ -184,6 +181,6 @@ def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypa
     cells = records[0]["rows"]["generated"]
     assert all(cells[column]["value"] is not None for column in ("own_distance", "own_pckh", "own_depth"))
     assert set(cells) == set(COLUMNS) - {"fps"}
-    assert records[0]["resolution"] == "256 x 256 x 8"
+    assert records[0]["choices"]["resolution"] == "256 x 256 x 8"
     assert records[0]["rows"]["floor"]["own_pckh"]["value"] == load_pose_depth_network().card["errors"]["pckh"]
     assert "| floor |" in capsys.readouterr().out

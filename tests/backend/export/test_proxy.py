@@ -19,7 +19,6 @@ from primdiffusion.export.proxy import (
     skin_weights,
     write_proxy_arrays,
     write_proxy_glb,
-    write_proxy_obj,
 )
 from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import OuterSurface, depth_below, outside_surface
@@ -111,21 +110,9 @@ def test_glb_is_read_by_trimesh_with_texture_and_the_same_surface(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "p.glb"]
 
 
-def test_obj_has_material_and_texture_beside_it(tmp_path):
-    write_proxy_obj(tmp_path / "eine Frau ä.obj", proxy())
-    assert {path.name for path in tmp_path.iterdir()} == {"eine Frau ä.obj", "eine Frau ä.mtl", "eine Frau ä.png"}
-    mesh = trimesh.load(tmp_path / "eine Frau ä.obj", process=False)
-    assert len(mesh.faces) == len(proxy().faces)
-
-
-@pytest.mark.parametrize("ending", [".glb", ".obj"])
-def test_files_for_other_programs_have_the_soles_at_0(tmp_path, ending):
-    path = tmp_path / f"p{ending}"
-    if ending == ".glb":
-        write_proxy_glb(path, proxy(), {})
-    else:
-        write_proxy_obj(path, proxy())
-    low, high = trimesh.load(path, force="mesh", process=False).bounds[:, 1]
+def test_files_for_other_programs_have_the_soles_at_0(tmp_path):
+    write_proxy_glb(tmp_path / "p.glb", proxy(), {})
+    low, high = trimesh.load(tmp_path / "p.glb", force="mesh", process=False).bounds[:, 1]
     assert low == pytest.approx(0, abs=0.05)  # the surface is off the body's by clothes and voxels
     assert 1.5 < high < 2.0
     body = default_body().shape(torch.as_tensor(person().betas)).vertices[:, 1]

@@ -7,10 +7,8 @@ import zipfile
 
 import numpy as np
 import pytest
-from primdiffusion.files import regular_files
 from primdiffusion.files.arrays import (
     all_finite,
-    array_names,
     array_shape,
     read_arrays,
     read_npy,
@@ -69,13 +67,6 @@ def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
     assert_one_sentence(raised.value, path)
 
 
-def test_megabytes_of_zeros_are_not_unpacked(tmp_path):
-    size = 65 * 2**20
-    path = npz(tmp_path / "bomb.npz", npy("'|u1'", f"({size},)", bytes(size)))
-    with refused(FileError, "65 MB"):
-        read_arrays(path, ("pose",))
-
-
 def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("primdiffusion.files.arrays.LARGEST_BYTES", 1000)
     path = tmp_path / "two.npz"
@@ -83,15 +74,6 @@ def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     with refused(FileError):
         read_arrays(path, ("a", "b"))
     assert len(read_arrays(path, ("b",))["b"]) == 100
-
-
-@pytest.mark.parametrize("read", [read_npy, array_names])
-def test_folders_and_pipes_are_not_opened(tmp_path, read):
-    with pytest.raises(IsADirectoryError):
-        read(tmp_path)
-    os.mkfifo(tmp_path / "pipe")
-    with refused(PermissionError, "regular"):
-        read(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize(
@@ -123,12 +105,6 @@ def test_what_is_written_is_read(tmp_path):
     assert array_shape(tmp_path / "a.npz", "a") == (3, 2)
 
 
-def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
-    path = npz(tmp_path / "people.npz", npy("'|u1'", "(50000000, 1024, 8, 8, 8, 4)"))
-    with refused(FileError):
-        array_shape(path, "pose")
-
-
 def test_numbers_of_half_precision_are_checked_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -142,32 +118,6 @@ def test_headers_of_python_2_are_read_without_a_warning(tmp_path, recwarn):
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
     assert read_npy(tmp_path / "a.npy").shape == (1,)
     assert not recwarn
-
-
-@pytest.mark.unix
-def test_what_is_no_longer_a_regular_file_when_it_is_opened_is_not_read(tmp_path, monkeypatch):
-    path = tmp_path / "a.npz"
-    np.savez(path, pose=np.zeros(3))
-    status = os.stat(path)
-    path.unlink()
-    os.mkfifo(path)
-    keep_open = os.open(path, os.O_RDWR)  # or open waits for a writer
-    monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
-    try:
-        with refused(PermissionError, "regular"):
-            read_arrays(path, ["pose"])
-    finally:
-        os.close(keep_open)
-
-
-def test_what_grows_beyond_the_limit_before_it_is_opened_is_not_read(tmp_path, monkeypatch):
-    path = tmp_path / "a"
-    path.write_bytes(bytes(10))
-    status = os.stat(path)
-    path.write_bytes(bytes(30))
-    monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
-    with pytest.raises(regular_files.FileError):
-        regular_files.read_regular(path, 20)
 
 
 @pytest.mark.parametrize(("offset", "value"), [(8, 99), (8, 12), (6, 1)], ids=["unknown", "bzip2", "encrypted"])

@@ -1,6 +1,5 @@
 """Safetensors files whose bytes depend on their content alone."""
 
-import os
 import pickle
 import struct
 import subprocess
@@ -15,7 +14,7 @@ import torch
 from primdiffusion.files import smpl_pickle, torch_file
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.files.smpl_pickle import as_array, load_restricted
-from primdiffusion.files.tensor_file import LARGEST_FILE, ParameterLimit, load_network, read, save
+from primdiffusion.files.tensor_file import ParameterLimit, load_network, read, save
 from safetensors import safe_open
 from support.errors import refused
 from torch import nn
@@ -37,6 +36,9 @@ def test_another_reader_finds_what_was_saved(tmp_path):
     found = safetensors.torch.load_file(path)
     assert found.keys() == TENSORS.keys()
     assert all(torch.equal(found[name], value) and found[name].dtype == value.dtype for name, value in TENSORS.items())
+    tensors, metadata = read(path)
+    assert metadata == METADATA
+    assert all(torch.equal(tensors[name], value) for name, value in TENSORS.items())
 
 
 def test_processes_write_the_same_bytes():
@@ -53,26 +55,6 @@ def test_without_metadata_only_the_order_can_differ_from_safetensors():
 def test_a_view_is_refused():
     with refused(ValueError, "contiguous"):
         save({"x": torch.ones(3, 4).T})
-
-
-def test_what_was_saved_is_read(tmp_path):
-    path = tmp_path / "a.safetensors"
-    path.write_bytes(save(TENSORS, METADATA))
-    tensors, metadata = read(path)
-    assert metadata == METADATA
-    assert all(torch.equal(tensors[name], value) for name, value in TENSORS.items())
-
-
-def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
-    path = tmp_path / "a.safetensors"
-    with path.open("wb") as file:
-        file.truncate(LARGEST_FILE + 1)
-    with refused(FileError, "a.safetensors"):
-        read(path)
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(PermissionError):
-        read(path)
 
 
 def test_a_file_that_was_read_may_be_overwritten(tmp_path):
@@ -130,15 +112,6 @@ def test_the_sentence_names_what_a_pickle_would_have_run(tmp_path):
         archive.writestr("a/version", b"3")
     with refused(FileError, "os.system", "nothing was executed"):
         torch_file.load(tmp_path / "a.pt")
-
-
-def test_an_archive_that_unpacks_to_more_than_it_has_is_refused(tmp_path):
-    torch.save({"a": torch.zeros(1000)}, tmp_path / "a.pt")
-    with zipfile.ZipFile(tmp_path / "a.pt") as stored, zipfile.ZipFile(tmp_path / "b.pt", "w", 8) as packed:
-        for name in stored.namelist():
-            packed.writestr(name, stored.read(name))
-    with refused(FileError, "compressed"):
-        torch_file.load(tmp_path / "b.pt")
 
 
 def test_writing_to_what_was_loaded_leaves_the_file_as_it_is(tmp_path):

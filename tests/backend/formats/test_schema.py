@@ -184,7 +184,6 @@ GIVEN = {
 
 OTHERWISE = {
     "gaussians": {"out": "a.ply"},
-    "merge": {"out": "a.npz", "humans": ["a"]},
     "reconstruct": {"capture": "a"},
     "fit_posture": {"pictures": ["a"]},
     "inpaint": {"region": ["top"]},
@@ -241,9 +240,8 @@ def test_a_regions_corner_is_counted_from_the_top():
         ("reconstruct", {"pictures": ["a"]}, "capture"),
         ("reconstruct", {"seed": 3}, "seed"),
         ("fit_posture", {"pictures": []}, "pictures"),
-        ("merge", {"humans": []}, "humans"),
-        ("merge", {"people": GIVEN["people"]}, "humans"),
-        ("merge_frames", {"voxel": 0.0}, "voxel"),
+        ("merge", {"people": []}, "people"),
+        ("merge", {"voxel": 0.0}, "voxel"),
         ("gaussians", {"object": STILL}, "object"),
     ],
 )

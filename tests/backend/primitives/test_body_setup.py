@@ -27,7 +27,7 @@ def files(loaded, tmp_path):
     folder, setup = loaded
     for name in NAMES:
         shutil.copy(folder / name, tmp_path)
-    module._loaded.clear()
+    module._body_setup.cache_clear()
     module._known_sha256.cache_clear()
     return tmp_path, setup.files, setup
 

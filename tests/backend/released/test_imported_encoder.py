@@ -11,6 +11,7 @@ import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.capture.conditioning import captured_person
+from primdiffusion.commands.import_released import read_released
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import load_encoder, look_up
@@ -56,7 +57,7 @@ def folder(tmp_path_factory, stage) -> Path:
     save_body(folder)
     save_released(folder / "primdiffusion.pt", state(random_network(SMALL).state_dict(), template(), stage))
     save_capture(folder)
-    cli.run(line(folder, "imported.safetensors", "--report", str(folder / "report.json")))
+    cli.run(line(folder, "imported.safetensors"))
     return folder
 
 
@@ -66,13 +67,13 @@ def encoder_file(folder) -> Path:
 
 
 def test_all_475_tensors_are_imported_checked_or_dropped_with_a_reason(folder):
-    report = json.loads((folder / "report.json").read_text())
-    keys = list(torch.load(folder / "primdiffusion.pt", weights_only=True)["model_state_dict"])
-    assert [tensor["key"] for tensor in report["tensors"]] == keys
-    fates = {fate: [t for t in report["tensors"] if t["fate"] == fate] for fate in ("imported", "checked", "dropped")}
+    weights, inventory = read_released(folder / "primdiffusion.pt")
+    entries = inventory.account.entries
+    assert [entry.key for entry in entries] == list(weights)
+    fates = {fate: [entry for entry in entries if entry.fate == fate] for fate in ("imported", "checked", "dropped")}
     assert {fate: len(found) for fate, found in fates.items()} == {"imported": 437, "checked": 12, "dropped": 26}
-    assert {tensor["group"] for tensor in fates["dropped"]} == {"lbs_fn", "geo_fn", "decoder_geom"}
-    assert all(tensor["note"] for tensor in report["tensors"])
+    assert {entry.group for entry in fates["dropped"]} == {"lbs_fn", "geo_fn", "decoder_geom"}
+    assert all(entry.note for entry in entries)
 
 
 def test_the_file_holds_the_weights_as_they_were_and_nothing_of_smpl(folder, encoder_file, stage):

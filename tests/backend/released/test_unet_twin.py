@@ -1,21 +1,11 @@
 """The paper's U-Net against a second one, written in float64 from the names of its tensors and SPEC 3 alone."""
 
-import json
 import math
 
 import pytest
 import torch
-from diffusion_people import small_model
-from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
-from primdiffusion.diffusion.codec import WholeSlab
-from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import UNetConfig
-from primdiffusion.files.tensor_file import save
-from primdiffusion.training.config import TrainingConfig, check_resumable, to_json
 from released_files import random_network
-from safetensors import safe_open
-from support.errors import refused
 from torch import Tensor
 from torch.nn import functional
 
@@ -26,9 +16,9 @@ ATTENTIVE = UNetConfig(slab_channels=3, width=32, multipliers=(1, 2), blocks=1, 
 class Twin:
     """Layers are recognised by the names of their tensors."""
 
-    def __init__(self, tensors: dict[str, Tensor], heads: int, reads_input: bool = False):
+    def __init__(self, tensors: dict[str, Tensor], heads: int):
         self.w = {name: value.double() for name, value in tensors.items()}
-        self.heads, self.reads_input = heads, reads_input
+        self.heads = heads
 
     def linear(self, x: Tensor, name: str) -> Tensor:
         found = x @ self.w[f"{name}.weight"].T
@@ -72,8 +62,7 @@ class Twin:
     def transformer(self, x: Tensor, name: str) -> Tensor:
         tokens = self.conv(self.group_norm(x, f"{name}.norm", 1e-6), f"{name}.proj_in").flatten(2).transpose(1, 2)
         block = f"{name}.transformer_blocks.0"
-        context = x.flatten(2).transpose(1, 2) if self.reads_input else tokens
-        first = self.layer_norm(tokens, f"{block}.norm1")
+        context, first = tokens, self.layer_norm(tokens, f"{block}.norm1")
         tokens = tokens + self.attention(first, first, f"{block}.attn1")
         tokens = tokens + self.attention(self.layer_norm(tokens, f"{block}.norm2"), context, f"{block}.attn2")
         value, gate = self.linear(self.layer_norm(tokens, f"{block}.norm3"), f"{block}.ff.net.0.proj").chunk(2, -1)
@@ -154,43 +143,3 @@ def test_the_network_computes_what_its_names_and_the_reference_say(config):
         scale = found.abs().max()
         network.double()
         assert (network(x.double(), t) - found).abs().max() < 1e-6 * scale  # features of t are in float32
-        earlier = Twin(network.state_dict(), config.heads, reads_input=True)(x, t)
-        assert (earlier - found).abs().max() > 1e-3 * scale
-
-
-def without_the_entry(settings: str) -> str:
-    """Settings as the first versions wrote them."""
-    tree = json.loads(settings)
-    del tree["unet"]["attention_context"]
-    return json.dumps(tree)
-
-
-def test_networks_of_the_first_versions_are_told_apart_and_compute_as_they_did(tmp_path):
-    config = UNetConfig(width=32, multipliers=(1, 1), blocks=1, heads=2, attention_context="input")
-    network = random_network(config)
-    model = DiffusionModel(network, linear(), WholeSlab(), small_model().shapes, 25.5, {})
-    save_checkpoint(tmp_path / "new.safetensors", model, "linear")
-    with safe_open(tmp_path / "new.safetensors", "pt") as file:
-        tensors, metadata = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
-    architecture = json.loads(metadata["architecture"])
-    del architecture["config"]["attention_context"]
-    (tmp_path / "old.safetensors").write_bytes(save(tensors, {**metadata, "architecture": json.dumps(architecture)}))
-    x, t = noisy(56)
-    for name in ("new", "old"):
-        loaded = load_checkpoint(tmp_path / f"{name}.safetensors").denoiser
-        assert loaded.config == config
-        with torch.no_grad():
-            expected = Twin(loaded.state_dict(), 2, reads_input=True)(x, t)
-            assert (loaded(x, t) - expected).abs().max() < 1e-5 * expected.abs().max()
-
-
-def test_runs_of_the_first_versions_resume_with_their_own_attention(tmp_path):
-    def settings(**changes: object) -> TrainingConfig:
-        return TrainingConfig(data=tmp_path / "people", run=tmp_path / "run", preset="paper", **changes)
-
-    old = without_the_entry(to_json(settings()))
-    check_resumable(old, settings(unet=UNetConfig(attention_context="input")))
-    with refused(ValueError, "unet.attention_context"):
-        check_resumable(old, settings())
-    usual = TrainingConfig(data=tmp_path / "people", run=tmp_path / "run")
-    check_resumable(without_the_entry(to_json(usual)), usual)

@@ -93,7 +93,7 @@ def test_letters_of_all_languages_stay_and_spaces_are_spaces():
 
 def test_the_command_line_prints_no_escape(tmp_path, capsys):
     path = tmp_path / f"{ESCAPE}.safetensors"
-    for arguments in (["info", str(path)], ["captures", "info", str(path)], ["--traceback", "info", str(path)]):
+    for arguments in (["info", str(path)], ["captures", "export", str(path)], ["--traceback", "info", str(path)]):
         with pytest.raises(SystemExit):
             cli.main(arguments)
         said = capsys.readouterr()

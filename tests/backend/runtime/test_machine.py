@@ -9,21 +9,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from primdiffusion import cli
-from primdiffusion.diffusion.gaussian import PersonPrior, _double
 from primdiffusion.files.regular_files import FileError, check_size
 from primdiffusion.runtime.device import best_device, device_info, has_bfloat16, has_fast_bfloat16
 from primdiffusion.runtime.machine import choose_device, memory, share_processors
 from primdiffusion.runtime.worker_process import THREAD_COUNTS, each, run_in_process
 from support.errors import refused
-from tiny_model import tiny_model
-from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
-from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 
 def test_peak_memory_keeps_what_was_given_back_and_is_none_of_the_program_that_started_this_one():
@@ -96,55 +89,6 @@ def test_a_device_by_another_name_is_a_usage_error(capsys, fails):
         assert "cpu, cuda, mps" in failed.err
     cli.main(["info", "--device", "cpu"])
     assert '"device": "cpu"' in capsys.readouterr().out
-
-
-class NoFloat64(TorchDispatchMode):
-    """Apple GPUs have no float64."""
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        out = func(*args, **(kwargs or {}))
-        for tensor in tree_leaves(out):
-            if isinstance(tensor, torch.Tensor):
-                assert (tensor.device.type, tensor.dtype) != ("mps", torch.float64), func
-        return out
-
-
-class PlainIndices(TorchFunctionMode):
-    """Indexing by slices and None without a device guard, which torch built for other devices lacks."""
-
-    def __init__(self, simulated):
-        super().__init__()
-        self.simulated = simulated
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        if func is not torch.Tensor.__getitem__ or args[0].device.type != "mps":
-            return func(*args, **(kwargs or {}))
-        shape = np.empty(args[0].shape, bool)[args[1]].shape
-        with unset_fake_temporarily():
-            return self.simulated(torch.empty(shape, dtype=args[0].dtype, device="meta"))
-
-
-def test_the_denoiser_needs_no_float64_on_an_apple_gpu(monkeypatch):
-    fake, model = FakeTensorMode(allow_non_fake_inputs=True), tiny_model()
-    components, latents = len(model.denoiser.prior.parity), model.codec.shape
-
-    def simulated(tensor):
-        return FakeTensor(fake, tensor.to("meta"), torch.device("mps"))
-
-    for name, buffer in model.denoiser.named_buffers():
-        model.denoiser._buffers[name] = simulated(buffer)
-    x, t = simulated(torch.empty(2, *latents)), simulated(torch.tensor([0, 1]))
-    # which cells a part has, and which kinds are possible, are values, and simulated tensors have none
-    shapes = {"_along": (components,), "picture": latents, "denoise_coefficients": (components,)}
-    for name, shape in shapes.items():
-        monkeypatch.setattr(
-            PersonPrior, name, lambda self, of, *_, shape=shape: simulated(torch.empty(len(of), *shape))
-        )
-    with fake, NoFloat64(), PlainIndices(simulated):
-        x0 = model.denoiser(x, t)
-        in_float64 = _double(x)
-    assert (in_float64.device.type, in_float64.dtype) == ("cpu", torch.float64)
-    assert (x0.device.type, x0.dtype, x0.shape) == ("mps", torch.float32, x.shape)
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,10 @@ import io
 import json
 import math
 import threading
-from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from primdiffusion.serve.server import RpcError, RpcRequest, Wire, _parameters, parse_request
+from primdiffusion.serve.server import RpcError, RpcRequest, Wire, parse_request
 from support.errors import refused
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
@@ -54,27 +52,3 @@ def test_lines_of_many_threads_do_not_mix_and_nan_is_not_sent():
     with refused(ValueError, "JSON"):
         wire.notify("n", value=math.nan)
     assert len(stream.getvalue().splitlines()) == 400
-
-
-@pytest.mark.parametrize(
-    "path", ["\n", "out\x1b[2J", "//host/x", r"\\host\x", "file:///x", "https://host/x", r"\\.\pipe\x"]
-)
-@pytest.mark.parametrize(
-    ("method", "field", "params"),
-    [
-        ("generate", "out_dir", {"seed": 1}),
-        ("variations", "out_dir", {"seeds": [1, 2]}),
-        ("render", "depth", {"human": "a.human", "out": "a.png"}),
-    ],
-)
-def test_nothing_is_written_to_a_server_or_a_path_of_control_characters(method, field, params, path):
-    ending = ".png" if field == "depth" else ""
-    with refused(RpcError, f"{method}.{field}") as caught:
-        _parameters(RpcRequest(method, {**params, field: path + ending}, 1, True))
-    assert str(caught.value).isprintable()
-
-
-def test_folders_of_any_language_may_be_written_to():
-    for path in ("/写真\u3000年", "out", "C:\\out", "a:b"):
-        asked = _parameters(RpcRequest("generate", {"seed": 1, "out_dir": path}, 1, True))
-        assert asked.out_dir == Path(path)

@@ -3,11 +3,10 @@
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.schedule import fine_linear, linear, sqrt_linear
+from primdiffusion.diffusion.schedule import fine_linear, linear
 from primdiffusion.training.cells import CellTask
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
@@ -16,17 +15,11 @@ from primdiffusion.training.losses import (
     blend_conditions,
     blends,
     closed_form,
-    level_weight,
     mixed,
-    objective,
     random_steps,
     weighted_error,
     x0_errors,
 )
-
-
-def leveled(levels, **kwargs):
-    return PhaseConfig(steps=1, batch=1, levels=levels, **kwargs)
 
 
 def latent_set(geometry, detailed):
@@ -52,31 +45,20 @@ def test_a_network_that_knows_more_has_less_error(prepared_once):
     assert errors["gaussian"][300] < errors["gaussian"][900]
 
 
-def test_log_uniform_levels_are_even_in_the_logarithm_of_noise_over_signal():
-    schedule = fine_linear()
-    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), leveled("log_uniform"))
-    ratio = (schedule.half_log_snr(0) - torch.tensor([schedule.half_log_snr(int(one)) for one in t])) / (
-        schedule.half_log_snr(0) - schedule.half_log_snr(999)
-    )
-    assert torch.histc(ratio.float(), 8, 0, 1).min() > 0.1 * len(t)
-    even = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), leveled("uniform"))
-    assert (t < 50).float().mean() > 6 * (even < 50).float().mean()
-
-
 def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
     schedule = fine_linear()
-    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), leveled("log_normal"), spread=0.05)
+    t = random_steps(
+        schedule,
+        20_000,
+        torch.Generator().manual_seed(0),
+        PhaseConfig(steps=1, batch=1, levels="log_normal"),
+        spread=0.05,
+    )
     clean, noise = schedule.levels(t, torch.empty(0, 1))
     ratio = (noise / clean).flatten().log()
     assert abs(float(ratio.median()) - math.log(2 * 0.05)) < 0.3
     assert ((ratio > math.log(0.01)) & (ratio < math.log(1.0))).float().mean() > 0.75
     assert (ratio > math.log(10.0)).float().mean() > 0.02
-    noisier = leveled("log_normal", level_median=10.0, level_width=0.5)
-    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), noisier, spread=0.05)
-    clean, noise = schedule.levels(t, torch.empty(0, 1))
-    ratio = (noise / clean).flatten().log()
-    assert abs(float(ratio.median()) - math.log(10 * 0.05)) < 0.1
-    assert ((ratio - math.log(10 * 0.05)).abs() < 1.0).float().mean() > 0.75
 
 
 def test_blends_stay_within_a_geometry_and_keep_the_variance():
@@ -109,54 +91,21 @@ def test_mixtures_are_weighted_sums_of_two():
     torch.testing.assert_close(mixed(samples, weights, indices), expected)
 
 
-def test_error_weights_have_mean_one_at_every_level():
-    error, std = torch.ones(2, 5), torch.rand(2, 5) + 0.1
-    for power in (0.0, 1.0, 2.0):
-        assert weighted_error(error, std, power).item() == pytest.approx(1.0, abs=1e-5)
+def test_errors_count_by_the_deviation_of_the_closed_form_with_mean_one_at_every_level():
+    assert weighted_error(torch.ones(2, 5), torch.rand(2, 5) + 0.1).item() == pytest.approx(1.0, abs=1e-5)
     wide = torch.tensor([[1.0, 3.0]])
-    assert weighted_error(torch.tensor([[0.0, 1.0]]), wide, 2.0).item() == pytest.approx(0.9, abs=1e-6)
-
-
-@pytest.mark.parametrize("schedule", [linear(), sqrt_linear()])
-def test_min_snr_weights_are_those_of_the_paper(schedule):
-    # Hang et al. 2023, table 1: min(SNR, gamma) for a network that predicts x0
-    config = PhaseConfig(steps=1, batch=1, weighting="min_snr", min_snr_gamma=5.0)
-    signal, noise = schedule.levels(torch.tensor([0, 300, 999]), torch.zeros(3, 1))
-    weight = level_weight(signal, noise, config)[:, 0]
-    snr = schedule.alpha_bar / (1 - schedule.alpha_bar)
-    assert weight.tolist() == pytest.approx([min(float(snr[t]), 5.0) for t in (0, 300, 999)], rel=1e-5)
-    assert weight[0] == 5
-    assert torch.equal(level_weight(signal, noise, PhaseConfig(steps=1, batch=1, weighting="plain")), torch.ones(3, 1))
-
-
-def test_weightings_weight_what_they_say():
-    error, std = torch.tensor([[1.0, 2.0], [3.0, 0.0]]), torch.tensor([[1.0, 2.0], [0.5, 1.0]])
-    signal, noise = torch.tensor([[0.8], [0.1]]), torch.tensor([[0.6], [0.995]])
-    losses = {
-        name: objective(
-            error, std, signal, noise, PhaseConfig(steps=1, batch=1, weighting=name, error_power=0.0)
-        ).item()
-        for name in ("whitened", "plain", "min_snr")
-    }
-    assert losses["whitened"] == pytest.approx((1 + 1 + 36 + 0) / 4)
-    assert losses["plain"] == pytest.approx((1 + 4 + 9) / 4)
-    assert losses["min_snr"] == pytest.approx(((0.8 / 0.6) ** 2 * 5 + (0.1 / 0.995) ** 2 * 9) / 4)
+    assert weighted_error(torch.tensor([[0.0, 1.0]]), wide).item() == pytest.approx(0.75, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", ["person", "local"])
-def test_every_weighting_trains_both_networks(prepared_once, name):
+def test_both_networks_learn(prepared_once, name):
     config, prepared = prepared_once
-    losses = []
-    for weighting in ("whitened", "plain", "min_snr"):
-        phases = {key: dataclasses.replace(getattr(config, key), weighting=weighting) for key in ("person", "local")}
-        task = CellTask(dataclasses.replace(config, **phases), prepared, torch.device("cpu"))
-        task.network(name).requires_grad_(True)
-        loss = task.objective(name).loss(torch.Generator().manual_seed(0))
-        loss.backward()
-        losses.append(loss.item())
-        assert task.network(name).outer.weight.grad.abs().max() > 0
-    assert len(set(losses)) == 3
-    assert np.isfinite(losses).all()
+    task = CellTask(config, prepared, torch.device("cpu"))
+    task.network(name).requires_grad_(True)
+    loss = task.objective(name).loss(torch.Generator().manual_seed(0))
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert task.network(name).outer.weight.grad.abs().max() > 0
 
 
 def test_blends_are_asked_for_by_what_both_people_have():

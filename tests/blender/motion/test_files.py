@@ -42,7 +42,7 @@ def test_amass_is_read_with_y_up_and_without_hands(tmp_path, numbers, rate):
     np.savez(path, **amass(numbers), **{rate: np.array(120.0)})
     motion = read_motion(path)
     assert (motion.fps, motion.name) == (120.0, "walk_poses")
-    assert any("z is up" in note for note in motion.notes)
+    assert motion.detected.up == "z"
     np.testing.assert_allclose(motion.translations, MOVE, atol=1e-9)
     expected = THETA.copy()
     if numbers != 72:
@@ -55,14 +55,14 @@ def test_amass_that_has_y_up_already_is_left_alone(tmp_path):
     motion = read_motion(tmp_path / "m.npz")
     np.testing.assert_allclose(motion.rotations, from_axis_angle(THETA), atol=1e-9)
     np.testing.assert_allclose(motion.translations, MOVE, atol=1e-9)
-    assert any("y is up" in note for note in motion.notes)
+    assert motion.detected.up == "y"
 
 
-def test_amass_without_a_rate_gets_the_default_and_a_note(tmp_path):
+def test_amass_without_a_rate_gets_the_default(tmp_path):
     np.savez(tmp_path / "m.npz", **amass(156))
     motion = read_motion(tmp_path / "m.npz")
     assert motion.fps == DEFAULT_FPS
-    assert "states no frame rate: 30 frames per second are assumed" in motion.notes
+    assert motion.detected.fps == 0
 
 
 def test_smplx_by_parts_is_read(tmp_path):
@@ -126,7 +126,7 @@ def test_npy_of_one_pose_is_read(tmp_path, shape):
     np.save(tmp_path / "p.npy", THETA[0].reshape(shape).astype(np.float32))
     motion = read_motion(tmp_path / "p.npy")
     np.testing.assert_allclose(motion.axis_angle()[0], THETA[0], atol=1e-6)
-    assert motion.notes == ()
+    assert motion.detected.doubt == ""
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...files.regular_files import FileError, as_file_error, read_regular
 from ..joints import JOINT_NAMES
-from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
+from .motion import DEFAULT_FPS, LARGEST_NUMBER, Detected, Motion
 from .rigs import NAME_BONES, UNMATCHED, BoneMap, map_bones, retarget
 from .rotation import about_axis
 from .skeleton import REST_JOINTS
@@ -212,24 +212,20 @@ def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> tuple[Motion,
     tips = {joint: f"{bones.joints[joint]}_end" for joint in ("left_wrist", "right_wrist")}
     tips = {joint: end for joint, end in tips.items() if end in index} | bones.tips
     turned, root = hierarchy.world()
-    notes = [f"bones as {bones.rig} names them"]
     at_rest = turned
     if not is_standing({joint: places[index[bone]] for joint, bone in bones.joints.items()}):
         frame = _standing_frame(hierarchy, turned, {joint: index[bone] for joint, bone in bones.joints.items()})
         places = hierarchy.places(turned[frame : frame + 1])[0]
         at_rest = turned @ np.swapaxes(turned[frame], -1, -2)
-        notes.append(f"its rest is no pose of a person: frame {frame + 1}, in which one stands, takes its place")
     rest = {name: places[number] for name, number in index.items()}
     turns = {bone: at_rest[:, index[bone]] for bone in bones.joints.values()}
     rotations, from_file = retarget(dataclasses.replace(bones, tips=tips), rest, turns)
     metres, unit = _unit({joint: rest[bone] for joint, bone in bones.joints.items()})
     pelvis = _pelvis(hierarchy, turned, root, index[bones.joints["pelvis"]]) @ from_file.T
     stated = 1 / hierarchy.frame_time if hierarchy.frame_time > 0 else 0.0
-    notes += [] if stated else [NO_RATE]
-    notes.append(f"lengths in {unit}, 1 taken as {metres:.4g} m so that the legs are an average person's")
     detected = Detected(bones.rig, "y", f"{unit} (1 = {metres:.4g} m)", stated, bones.joints, average_legs=True)
     moved = pelvis * metres - REST_JOINTS[0]
-    return Motion(rotations, moved, stated or DEFAULT_FPS, path.stem, tuple(notes), detected), from_file
+    return Motion(rotations, moved, stated or DEFAULT_FPS, path.stem, detected), from_file
 
 
 def _standing_frame(hierarchy: Hierarchy, turned: NDArray, joints: Mapping[str, int]) -> int:

@@ -21,7 +21,6 @@ from . import mhr
 from .bvh import read_bvh
 from .motion import (
     DEFAULT_FPS,
-    NO_RATE,
     RATES,
     Detected,
     Motion,
@@ -30,7 +29,7 @@ from .motion import (
     first_of,
     stated_rate,
 )
-from .people import choose, listed, people_in
+from .people import choose, people_in
 from .rotation import (
     about_axis,
     axis_direction,
@@ -82,7 +81,7 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
     - .npz, .json and .pkl of SAM 3D Body: see `mhr`.
     - .bvh: any rig that `rigs` knows.
 
-    Without a frame rate it is `DEFAULT_FPS`, with a note. Raises FileError where there is no such file, or it
+    Without a frame rate it is `DEFAULT_FPS`. Raises FileError where there is no such file, or it
     holds objects, NaN or other data, and ValueError for another `up`.
     """
     path = Path(path)
@@ -103,7 +102,9 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
             arrays, lengths = _arrays_of(path, _TREES[suffix](path), person)
             motion = motion_from_arrays(arrays, path)
             if lengths:
-                motion, expected = _with_people(motion, lengths), "" if mhr.holds_some(arrays) else "y"
+                detected = dataclasses.replace(motion.detected, people=tuple(lengths))
+                motion = dataclasses.replace(motion, detected=detected)
+                expected = "" if mhr.holds_some(arrays) else "y"
         else:
             arrays = _read_npz(path) if suffix == ".npz" else {"pose": read_npy(path)}
             motion = motion_from_arrays(arrays, path)
@@ -161,8 +162,7 @@ def motion_from_numbers(content: Any, name: str) -> Motion:
     translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
     stated = stated_rate(arrays, name)
     detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=stated)
-    notes = (NO_RATE,) if not stated and frames > 1 else ()
-    return Motion(rotations, translations, stated or DEFAULT_FPS, Path(name).stem, notes, detected)
+    return Motion(rotations, translations, stated or DEFAULT_FPS, Path(name).stem, detected)
 
 
 def _holds_smpl(arrays: Mapping[str, NDArray]) -> bool:
@@ -221,13 +221,6 @@ def _length(arrays: Mapping[str, NDArray]) -> int:
     return len(values) if values.ndim > 1 and not (values.ndim == 3 and values.shape[1:] == (3, 3)) else 1
 
 
-def _with_people(motion: Motion, lengths: Mapping[str, int]) -> Motion:
-    """The motion of one of the people in a file."""
-    detected = dataclasses.replace(motion.detected, people=tuple(lengths))
-    notes = (f"holds {len(lengths)} people: {listed(lengths)}",) if len(lengths) > 1 else ()
-    return dataclasses.replace(motion, notes=(*motion.notes, *notes), detected=detected)
-
-
 def _arrays(content: Any, name: str) -> dict[str, NDArray]:
     """The arrays of a mapping, or of poses alone."""
     if not isinstance(content, Mapping):
@@ -251,9 +244,7 @@ def _upright(motion: Motion, axes: NDArray, expected: str) -> Motion:
     up = axis_direction(pelvis_up(few.rotations[:, 0]))
     lying = _turned(motion, up, axis_name(axes.T @ up))
     doubt = "The person stands in no frame, whichever axis is up: set the up axis by hand if it is another one"
-    return dataclasses.replace(
-        lying, notes=(*lying.notes, doubt), detected=dataclasses.replace(lying.detected, doubt=doubt)
-    )
+    return dataclasses.replace(lying, detected=dataclasses.replace(lying.detected, doubt=doubt))
 
 
 def _turned(motion: Motion, up: NDArray, in_file: str) -> Motion:
@@ -262,7 +253,6 @@ def _turned(motion: Motion, up: NDArray, in_file: str) -> Motion:
         motion,
         rotations=rotations,
         translations=translations,
-        notes=(*motion.notes, f"{in_file} is up in the file"),
         detected=dataclasses.replace(motion.detected, up=in_file),
     )
 

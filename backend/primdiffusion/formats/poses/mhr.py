@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...files.regular_files import FileError
-from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, stated_rate
+from .motion import DEFAULT_FPS, RATES, Detected, Motion, check_numbers, stated_rate
 from .rigs import map_bones, retarget
 from .rotation import first_improper, from_axis_angle, improper_text, nearest
 from .skeleton import REST_JOINTS
@@ -144,9 +144,8 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
         raise FileError(path, f"has joints of no human ({e})", "save the poses again") from e
     pelvis = (at["root"] + camera * Y_UP) @ from_file.T
     stated = stated_rate(arrays, str(path))
-    notes = (NO_RATE,) if not stated and len(turns) > 1 else ()
     detected = Detected(bones.rig, "y", fps=stated, bones=bones.joints)
-    return Motion(rotations, pelvis - REST_JOINTS[0], stated or DEFAULT_FPS, path.stem, notes, detected)
+    return Motion(rotations, pelvis - REST_JOINTS[0], stated or DEFAULT_FPS, path.stem, detected)
 
 
 def _names(given: NDArray | None, path: Path) -> list[str]:

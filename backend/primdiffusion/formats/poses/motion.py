@@ -50,7 +50,6 @@ MOST_NUMBERS = 40_000_000
 LARGEST_FPS, SMALLEST_FPS = 10_000.0, 0.1
 DEFAULT_FPS = 30.0
 """Frame rate of motion whose file does not state it."""
-NO_RATE = f"states no frame rate: {DEFAULT_FPS:g} frames per second are assumed"
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate")
 """Names of a frame rate in files."""
 
@@ -67,8 +66,6 @@ class Motion:
     """Frames per second; 1 for single poses."""
     name: str
     """Name of the source."""
-    notes: tuple[str, ...] = ()
-    """What was detected or assumed when reading, a sentence each."""
     detected: Detected = dataclasses.field(default_factory=Detected)
 
     def __post_init__(self) -> None:

@@ -191,11 +191,6 @@ def picture(params: dict) -> dict:
 
 
 def merged(params: dict) -> dict:
-    write_grid(Path(params["out"]), params["people"][0], params)
-    return {"out": params["out"], "shape": [8, 6, 10]}
-
-
-def merged_frames(params: dict) -> dict:
     files = [Path(params["out_dir"]) / f"{index:04d}.npz" for index in range(len(params["people"]))]
     for path, person in zip(files, params["people"], strict=True):
         write_grid(path, person, params)
@@ -248,7 +243,6 @@ ANSWERS: dict[str, tuple[Callable[[dict], Steps], Callable[[dict], dict]]] = {
     "render": (at_once, picture),
     "draw": (bands, nothing),
     "merge": (merging, merged),
-    "merge_frames": (merging, merged_frames),
     "proxy": (at_once, proxy),
     "gaussians": (at_once, gaussians),
 }
