@@ -95,7 +95,7 @@ def draw_job_state(layout: bpy.types.UILayout, kind: str) -> None:
     if queue.current is not None and queue.current.job.kind == kind:
         if icon := icons.of(queue.request.picture):
             layout.template_icon(icon_value=icon, scale=_PICTURE_SCALE)
-        _draw_progress(layout)
+        draw_progress(layout)
     if waiting := sum(entry.job.kind == kind for entry in queue.waiting):
         layout.label(text=f"Queued: {waiting}", icon="SORTTIME", translate=False)
     if (outcome := queue.outcomes.get(kind)) is not None:
@@ -109,7 +109,7 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str, width: int = _L
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
 
 
-def _draw_progress(layout: bpy.types.UILayout) -> None:
+def draw_progress(layout: bpy.types.UILayout) -> None:
     """The running job: progress, time left, Cancel."""
     row = layout.row(align=True)
     row.progress(factor=1.0 if queue.ready else queue.request.fraction, text=_progress_text(), translate=False)
