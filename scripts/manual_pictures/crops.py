@@ -39,19 +39,19 @@ WINDOWS = {
 STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")}
 """The extension's part of the preferences, one below the other."""
 ROWS = {"window_picture": ("picture_posed", "picture_fitted", "picture_posed_made")}
-"""Camera's frame and sidebar of the main window, side by side."""
+"""Camera's frame of the main window, side by side."""
 DIALOGS = {"motion_dialog": "motion_dialog"}
 _ABOVE, BELOW = 24, {"window 0": 84, "view": 0}
 """Pixels of the main window that are left out above the 3D view and at its lower edge; "view" has the asset shelf. The
 properties and the timeline are left out too."""
 PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
-ROW_PART = (320, 80, 1300, 1100)
+ROW_PART = (320, 200, 990, 1100)
 """Pixels of the main window in ROWS."""
 _STACKED_ROWS = 130
 """Pixels of the preferences' part: down to the end of the backend's box while a set-up runs."""
 _WINDOW_WIDTH = 880
-_ROW_SIZE = (490, 510)
+_ROW_SIZE = (335, 450)
 _PANEL_WIDTH = 262
 _PANEL_RGB, _SECTION_RGB, _COLUMN, _RUN = 74, 67, 8, 10
 """Greys of panels, and of what is in their open sections, at this distance from the sidebar's left edge, over at least
