@@ -13,7 +13,7 @@ from ..jobs.error_log import error_log
 from ..jobs.follow import blocking_activity
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.windows import icons
-from ..places import EXTENSION, backend_is_named
+from ..places import EXTENSION, backend_is_named, preference
 
 MAIN = "PrimDiffusion"
 """Tab of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
@@ -135,7 +135,8 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # side by side the labels would be cut
-    if outcome.error.kind == "environment":
+    checkpoint = preference("checkpoint")
+    if outcome.error.kind == "environment" or (checkpoint and checkpoint in outcome.sentence):
         column.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     column.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(error_log())
 
