@@ -70,10 +70,10 @@ def crop_all(shots: Path, out: Path) -> None:
             if window in BELOW:
                 _, _, right, bottom = boxes["sidebar"]
                 part = picture.crop((0, _ABOVE, right, bottom - BELOW[window]))
-                size = (_WINDOW_WIDTH, round(part.height * _WINDOW_WIDTH / part.width))
-                save_jpeg(part.resize(size, Image.Resampling.LANCZOS), out / f"{name}.jpg")
+                part.thumbnail((_WINDOW_WIDTH, part.height), Image.Resampling.LANCZOS)
+                save_jpeg(part, out / f"{name}.jpg")
             else:
-                save_png(picture.crop(boxes[window]).crop(PREFERENCES_PART), out / f"{name}.png")
+                save_png(_filled(picture.crop(boxes[window]).crop(PREFERENCES_PART)), out / f"{name}.png")
     for name, seen in STACKS.items():
         if _are_there(shots, *seen):
             save_png(_column([_preferences_top(shots, shot) for shot in seen]), out / f"{name}.png")
@@ -97,6 +97,13 @@ def panels_of(shots: Path, shot: str) -> Image.Image:
         raise ValueError(f"{shot} shows no panel in its sidebar")
     end = int(np.flatnonzero(runs)[-1]) + _RUN + 2
     return picture.crop((left + 2, top, left + _PANEL_WIDTH, top + end))
+
+
+def _filled(picture: Image.Image) -> Image.Image:
+    """A picture without the rows at its lower edge that are all alike."""
+    rows = np.asarray(picture)
+    last = np.flatnonzero((rows != rows[-1]).any((1, 2)))[-1]
+    return picture.crop((0, 0, picture.width, min(int(last) + _GAP, picture.height)))
 
 
 def _changed_part(shots: Path, shot: str) -> Image.Image:

@@ -28,7 +28,7 @@ from start import (
     select,
     with_people,
 )
-from view_scenes import dragging, redraw, rendered, rendered_view, shadings, stalls
+from view_scenes import redraw, rendered, rendered_view, shadings, stalls
 from visible_scene import at_rest, visible_humans
 
 
@@ -271,7 +271,7 @@ def export(module: str, python: str) -> Steps:
     """A mesh, and the mesh proxy in the scene."""
     yield from with_people(module, python, FIRST_SEED)
     wide_view()
-    view()[1].spaces.active.shading.type = "SOLID"
+    view()[1].spaces.active.shading.type = "SOLID"  # which shows the mesh's texture as soon as it is there
     bpy.context.scene.primdiffusion_export.format = "GLB"
     yield from show("PRIMDIFFUSION_PT_export/proxy")
     yield "export_before"
@@ -280,9 +280,7 @@ def export(module: str, python: str) -> Steps:
     yield 3.0
     yield "export_working"
     yield from wait(lambda: not queue.busy, 300)
-    _, area = view()
-    area.spaces.active.shading.type = "MATERIAL"
-    yield 4.0
+    yield 2.0
     yield "export_proxy"
 
 
@@ -343,7 +341,6 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "motion": motion,
     "render": render,
     "shadings": shadings,
-    "dragging": dragging,
     "rendered": rendered,
     "captures": captures,
     "from_picture": from_picture,
