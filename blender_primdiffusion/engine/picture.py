@@ -126,21 +126,20 @@ def posed_humans(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | 
     Raises FileNotFoundError for a human whose file is missing, and ValueError for a shape that is no list of numbers or
     a pose that holds NaN.
     """
-    armatures = human_armatures(visible_instances(depsgraph, space))
-    return [pose_of(obj, matrix) for _, obj, matrix in armatures]
+    return [pose_of(armature, matrix) for armature, matrix in human_armatures(visible_instances(depsgraph, space))]
 
 
 def human_armatures(
     instances: Iterable[bpy.types.DepsgraphObjectInstance],
-) -> Iterator[tuple[bpy.types.Object, bpy.types.Object, NDArray[np.float64]]]:
-    """Of `visible_instances`, those that show a human: the object that shows it (the human, or what instances it), the
-    evaluated armature, which is valid until the next one, and its world matrix [4, 4]."""
+) -> Iterator[tuple[bpy.types.Object, NDArray[np.float64]]]:
+    """Of `visible_instances`, those that show a human: the evaluated armature, which is valid until the next one, and
+    its world matrix [4, 4]."""
     for instance in instances:
         obj = instance.object
         if is_human(obj) and all(name in obj.data.bones for name in JOINT_NAMES):
             matrix = np.array(instance.matrix_world, np.float64)
             if not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
-                yield (instance.parent or obj).original, obj, matrix
+                yield obj, matrix
 
 
 def pose_of(armature: bpy.types.Object, matrix: NDArray) -> PosedHuman:

@@ -105,10 +105,11 @@ def window_of(scene: bpy.types.Scene | None) -> Iterator[None]:
 
 
 def redraw() -> None:
-    """Redraw the sidebars of all windows, and the preferences, which do not notice progress themselves.
+    """Redraw sidebars, preferences and status bars of all windows, which do not notice progress themselves.
 
     Not the views beside them, which take long.
     """
+    bpy.msgbus.publish_rna(key=(bpy.types.ViewLayer, "name"))  # status bars, no areas of a screen, subscribe to it
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PREFERENCES":

@@ -46,7 +46,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     """`scene.primdiffusion_captures`."""
 
     people: bpy.props.StringProperty(
-        name="People", description="Folder of scans (.glb, .fbx, .obj) or of generated humans", subtype="DIR_PATH"
+        name="People", description="Folder of scans or of exported humans (.glb, .fbx, .obj)", subtype="DIR_PATH"
     )
     out: bpy.props.StringProperty(
         name="Captures", description="Folder of the dataset; an unfinished one is resumed", subtype="DIR_PATH"

@@ -13,7 +13,7 @@ from ..jobs.error_log import error_log
 from ..jobs.follow import blocking_activity
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.windows import icons
-from ..places import EXTENSION, backend_is_named
+from ..places import EXTENSION, backend_is_named, preference
 
 MAIN = "PrimDiffusion"
 """Tab of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
@@ -95,7 +95,7 @@ def draw_job_state(layout: bpy.types.UILayout, kind: str) -> None:
     if queue.current is not None and queue.current.job.kind == kind:
         if icon := icons.of(queue.request.picture):
             layout.template_icon(icon_value=icon, scale=_PICTURE_SCALE)
-        _draw_progress(layout)
+        draw_progress(layout)
     if waiting := sum(entry.job.kind == kind for entry in queue.waiting):
         layout.label(text=f"Queued: {waiting}", icon="SORTTIME", translate=False)
     if (outcome := queue.outcomes.get(kind)) is not None:
@@ -109,7 +109,7 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str, width: int = _L
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
 
 
-def _draw_progress(layout: bpy.types.UILayout) -> None:
+def draw_progress(layout: bpy.types.UILayout) -> None:
     """The running job: progress, time left, Cancel."""
     row = layout.row(align=True)
     row.progress(factor=1.0 if queue.ready else queue.request.fraction, text=_progress_text(), translate=False)
@@ -135,7 +135,8 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # side by side the labels would be cut
-    if outcome.error.kind == "environment":
+    checkpoint = preference("checkpoint")
+    if outcome.error.kind == "environment" or (checkpoint and checkpoint in outcome.sentence):
         column.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     column.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(error_log())
 

@@ -1,4 +1,5 @@
-"""Blender's own menus, and with them its search (F3): Add > Human, File > Import and Export; Viewport Overlays."""
+"""Blender's own menus, and with them its search (F3): Add > Human, File > Import and Export; Viewport Overlays;
+the status bar."""
 
 from __future__ import annotations
 
@@ -6,11 +7,15 @@ from pathlib import Path
 
 import bpy
 
+from ..jobs.queue import queue
 from ..places import EXTENSION, backend_is_named
 from ..scene.human import any_humans
+from .drawing import draw_progress
 from .preferences import known
 
 _IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply)"
+_STATUS_UNITS = 15
+"""Width of the running job in the status bar."""
 FOLDER = Path(__file__).resolve().parents[1] / "gallery"
 
 
@@ -62,11 +67,20 @@ def draw_switch(menu: bpy.types.Panel, context: bpy.types.Context) -> None:
         column.prop(context.scene.primdiffusion_render, "in_viewports")
 
 
+def draw_status(header: bpy.types.Header, _context: bpy.types.Context) -> None:
+    """In the status bar: the running job."""
+    if queue.current is not None:
+        row = header.layout.row()
+        row.ui_units_x = _STATUS_UNITS
+        draw_progress(row)
+
+
 _ENTRIES = (
     ("VIEW3D_MT_add", draw_add),
     ("TOPBAR_MT_file_import", draw_import),
     ("TOPBAR_MT_file_export", draw_export),
     ("VIEW3D_PT_overlay", draw_switch),
+    ("STATUSBAR_HT_header", draw_status),
 )
 
 

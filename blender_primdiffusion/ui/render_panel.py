@@ -91,8 +91,6 @@ def unregister() -> None:
 
 
 _SAMPLES = 4
-
-
 _ENGINES = (
     (
         ENGINE,

@@ -35,24 +35,23 @@ WINDOWS = {
     "window_proxy": ("export_proxy", "window 0"),
     "window_motion": ("motion_imported", "window 0"),
 }
-"""Whole windows, or one of PARTS."""
+"""Whole windows, or a part of the main one (BELOW)."""
 STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")}
 """The extension's part of the preferences, one below the other."""
 ROWS = {"window_picture": ("picture_posed", "picture_fitted", "picture_posed_made")}
-"""Camera's frame and sidebar of the main window, side by side."""
+"""Camera's frame of the main window, side by side."""
 DIALOGS = {"motion_dialog": "motion_dialog"}
-WINDOW_PART = (0, 24, 1320, 1190)
-"""Pixels of the main window: without the properties and the timeline."""
-PARTS = {"window 0": WINDOW_PART, "view": (0, 24, 1320, 1274)}
-"""Of the main window; "view" goes down to the asset shelf."""
+_ABOVE, BELOW = 24, {"window 0": 84, "view": 0}
+"""Pixels of the main window that are left out above the 3D view and at its lower edge; "view" has the asset shelf. The
+properties and the timeline are left out too."""
 PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
-ROW_PART = (320, 80, 1300, 1100)
+ROW_PART = (320, 200, 990, 1100)
 """Pixels of the main window in ROWS."""
 _STACKED_ROWS = 130
 """Pixels of the preferences' part: down to the end of the backend's box while a set-up runs."""
 _WINDOW_WIDTH = 880
-_ROW_SIZE = (490, 510)
+_ROW_SIZE = (335, 450)
 _PANEL_WIDTH = 262
 _PANEL_RGB, _SECTION_RGB, _COLUMN, _RUN = 74, 67, 8, 10
 """Greys of panels, and of what is in their open sections, at this distance from the sidebar's left edge, over at least
@@ -68,12 +67,13 @@ def crop_all(shots: Path, out: Path) -> None:
     for name, (shot, window) in WINDOWS.items():
         if _are_there(shots, shot):
             picture, boxes = _read(shots, shot)
-            part = picture.crop(PARTS.get(window) or boxes[window])
-            if window in PARTS:
-                size = (_WINDOW_WIDTH, round(part.height * _WINDOW_WIDTH / part.width))
-                save_jpeg(part.resize(size, Image.Resampling.LANCZOS), out / f"{name}.jpg")
+            if window in BELOW:
+                _, _, right, bottom = boxes["sidebar"]
+                part = picture.crop((0, _ABOVE, right, bottom - BELOW[window]))
+                part.thumbnail((_WINDOW_WIDTH, part.height), Image.Resampling.LANCZOS)
+                save_jpeg(part, out / f"{name}.jpg")
             else:
-                save_png(part.crop(PREFERENCES_PART), out / f"{name}.png")
+                save_png(_filled(picture.crop(boxes[window]).crop(PREFERENCES_PART)), out / f"{name}.png")
     for name, seen in STACKS.items():
         if _are_there(shots, *seen):
             save_png(_column([_preferences_top(shots, shot) for shot in seen]), out / f"{name}.png")
@@ -97,6 +97,13 @@ def panels_of(shots: Path, shot: str) -> Image.Image:
         raise ValueError(f"{shot} shows no panel in its sidebar")
     end = int(np.flatnonzero(runs)[-1]) + _RUN + 2
     return picture.crop((left + 2, top, left + _PANEL_WIDTH, top + end))
+
+
+def _filled(picture: Image.Image) -> Image.Image:
+    """A picture without the rows at its lower edge that are all alike."""
+    rows = np.asarray(picture)
+    last = np.flatnonzero((rows != rows[-1]).any((1, 2)))[-1]
+    return picture.crop((0, 0, picture.width, min(int(last) + _GAP, picture.height)))
 
 
 def _changed_part(shots: Path, shot: str) -> Image.Image:

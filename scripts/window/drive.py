@@ -1,9 +1,9 @@
 """Runs inside Blender's window: installs the zip, then plays the scenes of `scenes.py` from a timer, step by step.
 
 A scene is a generator. It yields seconds to wait, the name of a screenshot to take, or an input:
-{"point": [x, y], "click": True}, {"point": [x, y], "drag": [dx, dy]} or {"key": "Escape", "times": 1}; figures to be
-written to a file: {"figures": {name: value}}; or {"pixels that differ": [name, name], "boxes": [...]}, which gets their
-number between two screenshots, for each box [left, top, right, bottom].
+{"point": [x, y], "click": True} or {"key": "Escape", "times": 1}; figures to be written to a file:
+{"figures": {name: value}}; or {"pixels that differ": [name, name], "boxes": [...]}, which gets their number between two
+screenshots, for each box [left, top, right, bottom].
 """
 
 from __future__ import annotations

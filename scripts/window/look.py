@@ -73,7 +73,7 @@ def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, tim
 
 
 def do(request: dict, out: Path, display: str) -> list[int] | None:
-    """Take a screenshot, note figures, click, drag, press a key, or compare screenshots; returns an answer, if any.
+    """Take a screenshot, note figures, click, press a key, or compare screenshots; returns an answer, if any.
 
     Blender's own screenshots are black with software OpenGL.
     """
@@ -93,15 +93,6 @@ def do(request: dict, out: Path, display: str) -> list[int] | None:
     if request.get("click"):
         time.sleep(0.3)
         subprocess.run([*hand, "click", "1"], check=True, env=environment)
-    if "drag" in request:
-        time.sleep(0.3)
-        subprocess.run([*hand, "mousedown", "1"], check=True, env=environment)
-        step = [str(pixels // 10) for pixels in request["drag"]]
-        for _ in range(10):
-            time.sleep(0.1)
-            subprocess.run([*hand, "mousemove_relative", "--", *step], check=True, env=environment)
-        time.sleep(0.3)
-        subprocess.run([*hand, "mouseup", "1"], check=True, env=environment)
     if "key" in request:
         times = ["--delay", "2", "--repeat", str(request.get("times", 1)), "--repeat-delay", "2"]
         subprocess.run([*hand, "key", *times, request["key"]], check=True, env=environment)

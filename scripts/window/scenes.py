@@ -28,7 +28,7 @@ from start import (
     select,
     with_people,
 )
-from view_scenes import dragging, redraw, rendered, rendered_view, shadings, stalls
+from view_scenes import redraw, rendered, rendered_view, shadings, stalls
 from visible_scene import at_rest, visible_humans
 
 
@@ -52,7 +52,7 @@ def set_up(module: str, python: str) -> Steps:
 
 
 def newcomer(module: str, python: str) -> Steps:
-    """Blender's own ways to a human: Shift-A, F3, File > Import; F12 without a backend; the status bar during a job."""
+    """Blender's own ways to a human: Shift-A, F3, File > Import; F12 without a backend."""
     yield from begin(module, "")
     yield {"point": [500, 700]}
     for name, keys in {"add": ("shift+a", *"hum"), "search": ("F3", *"generate")}.items():
@@ -89,6 +89,10 @@ def first_human(module: str, python: str) -> Steps:
     yield "first_starting"
     yield from wait(lambda: not queue.busy or has_picture(queue), 120)
     yield "first_denoising"
+    window, _ = view()
+    status_bar = [0, window.height - STATUS_BAR_PX, window.width, window.height]
+    if not (yield {"pixels that differ": ["first_starting", "first_denoising"], "boxes": [status_bar]})[0]:
+        raise RuntimeError("the status bar does not show the job's progress")
     yield from wait(lambda: not queue.busy, 240)
     yield from at_rest(module)
     yield "first_solid"
@@ -236,7 +240,7 @@ def motion(module: str, python: str) -> Steps:
 def render(module: str, python: str) -> Steps:
     """Engine and Cycles, what shows the human, merging, gain."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("render", *(f"advanced/{section}" for section in ("show_as", "merge", "look", "facts")))
+    names = ("render", *(f"advanced/{section}" for section in ("show_as", "merge", "facts")))
     yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
     press("primdiffusion.set_up_engine", engine="CYCLES")
     yield "render_cycles"
@@ -267,7 +271,7 @@ def export(module: str, python: str) -> Steps:
     """A mesh, and the mesh proxy in the scene."""
     yield from with_people(module, python, FIRST_SEED)
     wide_view()
-    view()[1].spaces.active.shading.type = "SOLID"
+    view()[1].spaces.active.shading.type = "SOLID"  # which shows the mesh's texture as soon as it is there
     bpy.context.scene.primdiffusion_export.format = "GLB"
     yield from show("PRIMDIFFUSION_PT_export/proxy")
     yield "export_before"
@@ -276,9 +280,7 @@ def export(module: str, python: str) -> Steps:
     yield 3.0
     yield "export_working"
     yield from wait(lambda: not queue.busy, 300)
-    _, area = view()
-    area.spaces.active.shading.type = "MATERIAL"
-    yield 4.0
+    yield 2.0
     yield "export_proxy"
 
 
@@ -324,6 +326,9 @@ def click_generate() -> Steps:
 GENERATE_BUTTON_PX = 118
 """Distance from the top of the sidebar, with the panel as it opens."""
 
+STATUS_BAR_PX = 20
+"""Height of the status bar, less its border."""
+
 SCENES: dict[str, Callable[[str, str], Steps]] = {
     "set_up": set_up,
     "newcomer": newcomer,
@@ -336,7 +341,6 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "motion": motion,
     "render": render,
     "shadings": shadings,
-    "dragging": dragging,
     "rendered": rendered,
     "captures": captures,
     "from_picture": from_picture,

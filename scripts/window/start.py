@@ -71,7 +71,8 @@ def queue_of(module: str):
 def cancel_all(module: str) -> Steps:
     queue = queue_of(module)
     while queue.busy:
-        press("primdiffusion.cancel")
+        if queue.current is not None:  # none is between two jobs
+            press("primdiffusion.cancel")
         yield 0.3
 
 

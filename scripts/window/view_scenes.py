@@ -10,7 +10,6 @@ from importlib import import_module
 
 import bpy
 import gpu
-from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Quaternion
 from panels import show, view, wide_view
 from press import Steps, press, wait
@@ -25,7 +24,7 @@ AFTERWARDS_S = 3.0
 
 
 def shadings(module: str, python: str) -> Steps:
-    """Two humans among solids in each shading, turned, clipped and from the camera; clicks select them."""
+    """Two humans among solids in each shading, turned, clipped and from the camera."""
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
     clear_of_the_sidebar()
     armatures()[1].location.y -= 1.0  # in front of the plane
@@ -47,54 +46,13 @@ def shadings(module: str, python: str) -> Steps:
         space.region_3d.view_rotation = Quaternion((0, 0, 1), 0.1) @ space.region_3d.view_rotation
         yield 0.3
     yield "shadings_turning"
-    bpy.ops.object.select_all(action="DESELECT")
     region = next(region for region in area.regions if region.type == "WINDOW")
-    for armature in armatures():
-        chest = armature.matrix_world @ armature.pose.bones["spine3"].head
-        x, y = location_3d_to_region_2d(region, space.region_3d, chest)
-        yield {"point": [int(region.x + x) + 9, int(window.height - region.y - y)], "click": True}
-        yield 2.0
-        selected = [obj.name for obj in bpy.context.selected_objects]
-        if selected != [armature.name]:
-            raise RuntimeError(f"a click on {armature.name} selected {selected}")
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.screen.region_quadview()
     yield 15.0
     yield "shadings_quad"
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.screen.region_quadview()
-
-
-def dragging(module: str, python: str) -> Steps:
-    """With the tool Tweak a press on a human selects it, a drag moves it, and each is one undo step."""
-    yield from with_people(module, python, FIRST_SEED)
-    wide_view()
-    window, area = view()
-    region = next(region for region in area.regions if region.type == "WINDOW")
-    area.spaces.active.shading.type = "SOLID"
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.wm.tool_set_by_id(name="builtin.select", space_type="VIEW_3D")
-        bpy.ops.object.select_all(action="DESELECT")
-        bpy.ops.ed.undo_push(message="Before")
-    yield 15.0
-    (armature,) = armatures()
-    start = armature.location.copy()
-    chest = armature.matrix_world @ armature.pose.bones["spine3"].head
-    x, y = location_3d_to_region_2d(region, area.spaces.active.region_3d, chest)
-    point = [int(region.x + x) + 9, int(window.height - region.y - y)]
-    yield {"point": point, "drag": [200, 0]}
-    yield 3.0
-    yield "dragging"
-    moved = (armatures()[0].location - start).length
-    yield {"key": "ctrl+z"}
-    yield 3.0
-    (armature,) = armatures()
-    if moved < 0.1 or armature.location != start or not armature.select_get():
-        raise RuntimeError(f"moved by {moved:.3f} m; after undo at {armature.location[:]}, {armature.select_get()}")
-    yield {"point": point, "click": True}
-    yield 2.0
-    if armatures()[0].location != start:
-        raise RuntimeError("a click moved the human")
 
 
 def rendered(module: str, python: str) -> Steps:

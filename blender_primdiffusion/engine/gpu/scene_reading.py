@@ -74,8 +74,6 @@ def gpu_humans() -> GpuHumans:
 class ShownHuman:
     """A human whom a 3D view shows."""
 
-    object_uid: int
-    """The armature's `session_uid`, or that of the object that instances it; a reference would not outlive undo."""
     pose: PosedHuman
     placed: tuple[GpuPayload, Boxes]
 
@@ -129,17 +127,17 @@ class SceneReader:
     def read(self, content: ViewContent, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
         """What the space shows, whose content this is."""
         humans: dict[object, ShownHuman] = {}
-        candidates: list[tuple[bpy.types.Object, bpy.types.Object, PosedHuman | Exception]] = []
+        candidates: list[tuple[bpy.types.Object, PosedHuman | Exception]] = []
         bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object | None]() for kind in content.types}
         errors, complete, end = [""], True, time.monotonic() + READING_S
-        for obj, armature, matrix in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
+        for armature, matrix in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
             if armature.show_in_front or armature.original.mode != "OBJECT":
                 bones.append(_bones(armature, matrix))
             try:
-                candidates.append((obj, armature.original, pose_of(armature, matrix)))
+                candidates.append((armature.original, pose_of(armature, matrix)))
             except (ValueError, OSError) as error:
-                candidates.append((obj, armature.original, error))
-        for number, (obj, person, pose) in enumerate(candidates, 1):
+                candidates.append((armature.original, error))
+        for number, (person, pose) in enumerate(candidates, 1):
             shown = {kind for kind, found in noted.items() if person in found}
             if not shown.isdisjoint(("mesh", "pointcloud")) or (content.by_volumes and "volume" in shown):
                 continue
@@ -152,7 +150,7 @@ class SceneReader:
                 if "volume" not in shown:  # Blender's fog shows where the human is
                     errors.append(str(error))
                 continue
-            humans[key] = ShownHuman(obj.session_uid, pose, placed)
+            humans[key] = ShownHuman(pose, placed)
             if not known and number < len(candidates) and time.monotonic() > end:
                 complete = False
                 break

@@ -10,17 +10,19 @@ import bpy
 import pytest
 import synthetic_shape
 from blend_tampering import in_preferences
+from jobs_driven import Layout
 from shown_words import classes
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
 import sidebar
 
+from blender_primdiffusion.backend.requests import RequestError
 from blender_primdiffusion.jobs.queue import JobOutcome, queue
 from blender_primdiffusion.jobs.variations import Variation, sheet
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human_file import shape_model_of
-from blender_primdiffusion.ui import generate_panel
+from blender_primdiffusion.ui import drawing, generate_panel
 
 pytestmark = pytest.mark.any_blender
 SMALL_WINDOW_PX = 620
@@ -136,3 +138,18 @@ def test_an_operator_gives_a_reason_only_where_it_is_disabled(human):
         said: list[str] = []
         allowed = poll.__func__(type("Stub", (), {"poll_message_set": staticmethod(said.append)}), bpy.context)
         assert bool(said) != allowed, cls.__name__
+
+
+@pytest.mark.parametrize(
+    ("kind", "sentence", "in_preferences"),
+    [
+        ("environment", "torch is missing", True),
+        ("missing_file", "there is no checkpoint at /nowhere/model.safetensors", True),
+        ("missing_file", "there is no file /elsewhere/anna.human", False),
+    ],
+)
+def test_an_error_leads_to_the_preferences_where_they_are_at_fault(addon, monkeypatch, kind, sentence, in_preferences):
+    monkeypatch.setattr(drawing, "preference", {"checkpoint": "/nowhere/model.safetensors"}.get)
+    layout = Layout()
+    drawing._draw_outcome(layout, JobOutcome(MagicMock(), error=RequestError(sentence, "", kind)))
+    assert layout.of("button") == [*(["preferences.addon_show"] if in_preferences else []), "wm.path_open"]

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import pytest
-from jobs_driven import shown
+from jobs_driven import Layout, shown, until_running
 
+from blender_primdiffusion.jobs import windows
+from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.ui import menus, preferences
 
 pytestmark = pytest.mark.any_blender
@@ -35,3 +40,23 @@ def test_the_entries_come_and_go_with_the_extension(addon):
         assert menus.draw_add not in bpy.types.VIEW3D_MT_add._dyn_ui_initialize()
     finally:
         menus.register()
+
+
+def test_the_status_bar_shows_the_running_job_and_is_redrawn_with_it(addon, monkeypatch):
+    def in_status_bar() -> list[str]:
+        layout = Layout()
+        menus.draw_status(SimpleNamespace(layout=layout), addon)
+        return layout.of("text", "button")
+
+    assert not in_status_bar()
+    queue.add(addon, GenerateJob(11, {"steps": 4}))
+    until_running()
+    progress, button = in_status_bar()
+    assert progress.startswith(queue.request.message)
+    assert button == "primdiffusion.cancel"
+    queue.drop()
+    windows.redraw()  # Blender takes the key
+    published = []
+    monkeypatch.setattr(bpy.msgbus, "publish_rna", lambda *, key: published.append(key))
+    windows.redraw()
+    assert published == [(bpy.types.ViewLayer, "name")]
