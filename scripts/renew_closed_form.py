@@ -58,7 +58,7 @@ def main() -> None:
     shapes = fit_shapes(latents, prior)
     assert isinstance(base.denoiser, PersonDenoiser)
     denoiser = with_prior(base.denoiser, prior)
-    card = {**base.card, "geometries": len(latents.betas), "people": len(latents)}
+    card = {**base.card, "closed_form_geometries": len(latents.betas), "closed_form_people": len(latents)}
     model = DiffusionModel(
         denoiser, base.schedule, base.codec, shapes, base.full_density, card, vocabulary, base.chain
     )  # fmt: skip

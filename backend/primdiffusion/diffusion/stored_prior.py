@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
-from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.files.tensor_file import under
-from primdiffusion.primitives.primitives import GRID, K
+from primdiffusion.primitives.primitives import GRID
 
 SYMMETRIC = 1e-4
 """Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
@@ -50,8 +46,7 @@ def _store_effects(tensors: dict[str, Tensor]) -> None:
 
 
 def restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
-    """Undo `store_prior` in the denoiser's tensors of a file, and complete priors of older files, whose components are
-    of the whole body.
+    """Undo `store_prior` in the denoiser's tensors of a file.
 
     Raises ValueError, KeyError and RuntimeError for tensors that do not fit together.
     """
@@ -60,19 +55,14 @@ def restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
         if len(kinds) * effects.shape[1] > MOST_CENTRES:
             raise ValueError(f"centres of kinds are {len(kinds)} times {effects.shape[1]} numbers")
         weights["prior_centre"] = (kinds @ effects).unflatten(0, weights["prior_log_weight"].shape)
-    older = "prior_part" not in weights
-    part = torch.zeros(K, dtype=torch.int64) if older else weights["prior_part"].long()
-    half = weights.pop("prior_basis_half", None)
+    for name in ("prior_part", "prior_head"):
+        weights[name] = weights[name].long()
+    half, part = weights.pop("prior_basis_half", None), weights["prior_part"]
     if half is not None:
         if half.ndim != 4 or half.shape[2:] != (GRID, GRID // 2) or half.shape[1] > codec.channels:
             raise ValueError(f"halves of person components have shape {tuple(half.shape)}")
         whole = _whole_components(half, part, weights["prior_parity"], codec)
-        weights["prior_basis"] = whole.flatten(1) if older else whole.mT[:, part.argsort(stable=True)].contiguous()
-    if older:
-        prior = PersonPrior.of_whole_body(**under(weights, "prior_"))
-        weights |= {f"prior_{field.name}": getattr(prior, field.name) for field in dataclasses.fields(prior)}
-    for name in ("prior_part", "prior_head"):
-        weights[name] = weights[name].long()
+        weights["prior_basis"] = whole.mT[:, part.argsort(stable=True)].contiguous()
 
 
 def _whole_components(

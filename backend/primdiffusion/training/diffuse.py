@@ -11,7 +11,7 @@ import torch
 import tyro
 from accelerate import PartialState
 
-from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
+from primdiffusion.diffusion.checkpoint import file_hash, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.people.stored_people import PersonFolder
@@ -28,6 +28,8 @@ from primdiffusion.version import __version__
 MODEL = "model.safetensors"
 PHASES = ("person", "local", "slab")
 """Networks of both presets."""
+CLOSED_FORM = ("closed_form_geometries", "closed_form_people")
+"""What a card says of the people of a closed form that is not that of the training data."""
 DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fitted to renders of their meshes"
 LIMITS = (
     "The humans are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "
@@ -116,7 +118,8 @@ def _card(
         "parameters": sum(p.numel() for state in states.values() for p in state.network.parameters()),
     }
     if config.start_from is not None:
-        card |= {"started_from": file_hash(config.start_from)}
+        start = read_card(config.start_from)
+        card |= {"started_from": file_hash(config.start_from)} | {k: start[k] for k in CLOSED_FORM if k in start}
     if config.made_of == "makehuman":
         card |= {"licence": "CC0-1.0", "data": DATA, "limits": _limits(config)}
     if isinstance(task, SlabTask):

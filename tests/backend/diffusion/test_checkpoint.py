@@ -120,21 +120,6 @@ def test_centres_that_are_sums_of_few_effects_are_stored_as_factors(path):
         load_checkpoint(path)
 
 
-def test_a_prior_of_before_parts_is_one_of_the_whole_body(path):
-    model = small_model()
-    save_checkpoint(path, model, "linear")
-    later = ("part", "left", "head", "head_axes", "head_variance", "head_left", "shared", "head_shared")
-
-    def before(tensors):
-        kept = {key: value for key, value in tensors.items() if key.removeprefix("denoiser.prior_") not in later}
-        return kept | {"denoiser.prior_basis": tensors["denoiser.prior_basis"].mT.flatten(1).contiguous()}
-
-    rewrite(path, before)
-    read, prior = load_checkpoint(path).denoiser.prior, model.denoiser.prior
-    for field in dataclasses.fields(prior):
-        assert torch.allclose(getattr(read, field.name), getattr(prior, field.name), atol=2e-2), field.name
-
-
 def test_a_codec_of_before_weights_is_read_as_it_was(path):
     rewrite(path, lambda t: {k: v for k, v in t.items() if k not in ("codec.weight", "codec.dead_zone")})
     codec = load_checkpoint(path).codec.codec
@@ -230,7 +215,7 @@ def default():
 
 
 def test_the_default_checkpoint_is_small_and_says_what_it_is(default):
-    assert default_checkpoint().stat().st_size <= 64_000_000
+    assert default_checkpoint().stat().st_size <= 80_000_000
     assert {"licence", "data", "full_density", "seed", "steps", "device", "version"} <= default.card.keys()
     assert default.full_density == default.card["full_density"]
 
