@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from ..scene.human import any_humans
-from . import drawing_child
+from . import drawing_child, viewport
 from .engine import ENGINE, PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine
 from .gpu import overlay
 from .view import view_engine
@@ -57,8 +57,11 @@ def _draw_humans() -> None:
     context = bpy.context
     if shows_humans(context):
         overlay.overlay.draw(context)
-    else:
-        overlay.overlay.leave(context.region)
+        return
+    overlay.overlay.leave(context.region)
+    humans = viewport.below_overlays.pop(context.region.as_pointer(), None)
+    if humans is not None and context.space_data.overlay.show_overlays:
+        overlay.erase_behind(context, humans)
 
 
 def _draw_error() -> None:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import functools
+import weakref
 
 import bpy
 import gpu
 from gpu_extras.presets import draw_texture_2d
 
-from .gpu.march import gpu_marcher
+from .gpu.march import GpuMarch, gpu_marcher
 from .gpu.picture import GpuPicture, GpuScene, GpuSolids
 from .gpu.refine import GpuRefinement, MarchRequest
 from .gpu.scene_reading import gpu_humans
 from .picture import SceneContent, SceneSolids, changed_by, scene_content, scene_solids
 from .view import region_view
+
+below_overlays: weakref.WeakValueDictionary[int, GpuMarch] = weakref.WeakValueDictionary()
+"""The humans of a view, by the region's address, until Blender has drawn its overlays over them."""
 
 
 class Viewport:
@@ -68,6 +72,7 @@ class Viewport:
             draw_texture_2d(self._texture, (0, 0), context.region.width, context.region.height)
             engine.unbind_display_space_shader()
             gpu.state.blend_set("NONE")
+            below_overlays[context.region.as_pointer()] = self._refinement.shown.picture.humans
         status = self._fault or self._error
         engine.update_stats("", f"PrimDiffusion: {status}" if status else "")
 

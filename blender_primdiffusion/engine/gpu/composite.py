@@ -53,7 +53,7 @@ void main()
   bool outside = any(lessThan(uv, frame.xy)) || any(greaterThan(uv, frame.zw));
   light.rgb *= outside ? 1.0 - lens.w : 1.0;
   gl_FragDepth = xray != 0 ? 1e-6 : far;
-  picture = light * opacity;
+  picture = erases != 0 ? vec4(1.0 - light.a) : light * opacity;
 }}
 """
 
@@ -71,6 +71,8 @@ class ViewLook:
     """The camera's picture."""
     darkening: float = 0.0
     """Outside of the frame."""
+    erases: bool = False
+    """Humans are below already: only what is drawn above them and is farther goes, as far as they are opaque."""
 
 
 def draw_picture(picture: GpuMarch, look: ViewLook, part: Part = WHOLE) -> None:
@@ -81,7 +83,7 @@ def draw_picture(picture: GpuMarch, look: ViewLook, part: Part = WHOLE) -> None:
     """
     matrix, parallel = look.window_matrix, look.window_matrix[3, 2] == 0
     shader = _picture_shader()
-    gpu.state.blend_set("ALPHA_PREMULT")
+    gpu.state.blend_set("MULTIPLY" if look.erases else "ALPHA_PREMULT")
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(not look.xray)
     shader.bind()
@@ -91,6 +93,7 @@ def draw_picture(picture: GpuMarch, look: ViewLook, part: Part = WHOLE) -> None:
     shader.uniform_float("frame", look.frame)
     shader.uniform_float("opacity", look.opacity)
     shader.uniform_int("xray", int(look.xray))
+    shader.uniform_int("erases", int(look.erases))
     left, bottom, right, top = (2 * edge - 1 for edge in part)
     corners = [(left, bottom), (right, bottom), (left, top), (right, top)]
     batch_for_shader(shader, "TRI_STRIP", {"pos": corners}).draw(shader)
@@ -148,6 +151,7 @@ def _picture_shader() -> gpu.types.GPUShader:
         ("VEC4", "frame"),
         ("FLOAT", "opacity"),
         ("INT", "xray"),
+        ("INT", "erases"),
     ):
         info.push_constant(kind, name)
     info.fragment_out(0, "VEC4", "picture")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..boxes import seen_part
 from ..view import camera_frame, region_view
 from .composite import ViewLook, draw_picture, keep_bones
-from .march import gpu_marcher
+from .march import GpuMarch, gpu_marcher
 from .refine import GpuRefinement, MarchRequest
 from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
 
@@ -141,6 +141,12 @@ def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
         to_window = np.array(around.window_matrix, np.float64) @ np.array(around.view_matrix, np.float64)
         pixel, size = context.preferences.system.pixel_size, (region.width, region.height)
         keep_bones(_in_pixels(bones, to_window, size), size, _STICK_PX * pixel, _JOINT_PX * pixel)
+
+
+def erase_behind(context: bpy.types.Context, humans: GpuMarch) -> None:
+    """Erase Blender's overlays, such as the grid, where they are behind humans that the view shows below them."""
+    keep_bones_in_front(context, overlay.reading(context).bones)
+    draw_picture(humans, ViewLook(np.array(context.region_data.window_matrix, np.float64), erases=True))
 
 
 def follow() -> None:

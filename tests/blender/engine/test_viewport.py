@@ -103,6 +103,7 @@ def test_a_view_is_refined_to_the_end(marcher, drawn):
     assert drawn.view._refinement.shown.coarseness == 1
     assert drawn.view._refinement.shown.sample > 0
     assert 0.05 < (whole[..., 3] > 0.99).mean() < 0.3
+    assert viewport.below_overlays[7] is drawn.view._refinement.shown.picture.humans
     human.location.x = 5.0
     bpy.context.view_layer.update()
     assert not refined(drawn).any()

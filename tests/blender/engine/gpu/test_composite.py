@@ -95,6 +95,26 @@ def test_a_faint_rim_is_as_far_as_what_it_surrounds():
     assert not shows(seen)[:, 9:].any()
 
 
+def test_overlays_behind_a_human_go_as_far_as_the_human_is_opaque():
+    look, colour = ViewLook(PERSPECTIVE, erases=True), np.broadcast_to(COLOUR, (*SIZE[::-1], 4)).copy()
+    colour[8:] *= 0.25
+    colour[:, 16:] = 0.0  # no human
+    seen = drawn(marched(colour=colour), look, window_depth(PERSPECTIVE, METRES + 1))
+    overlay = np.array([0.0, 1.0, 0.0, 1.0])
+    for part, left in ((seen[:8, :15], 0.0), (seen[8:, :15], 0.75), (seen[:, 17:], 1.0)):
+        np.testing.assert_allclose(part, np.broadcast_to(left * overlay, part.shape), atol=2e-3)
+    before = drawn(marched(), look, window_depth(PERSPECTIVE, METRES - 1))
+    np.testing.assert_array_equal(before, np.broadcast_to(overlay, before.shape))
+
+
+def test_bones_in_front_are_not_erased():
+    bones = np.array([[[4.0, 8.0], [28.0, 8.0]]])
+    look = ViewLook(PERSPECTIVE, erases=True)
+    seen = drawn(marched(), look, before=lambda: keep_bones(bones, SIZE, 2.0, 3.0))
+    assert seen[7:9, 4:28, 1].all()
+    assert not seen[:5].any()
+
+
 def test_xray_shows_humans_through_objects_and_objects_through_humans():
     look = ViewLook(PERSPECTIVE, opacity=0.25, xray=True)
     seen = drawn(marched(), look, window_depth(PERSPECTIVE, 1.0))

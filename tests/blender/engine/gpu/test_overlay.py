@@ -219,6 +219,35 @@ def test_clip_planes_follow_from_the_projection():
     assert clip_of(PARALLEL) == pytest.approx((-500, 500))
 
 
+def test_erasing_what_is_behind_humans_leaves_the_bones_of_the_same_reading(people, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(module, "overlay", people.overlay)
+    monkeypatch.setattr(module, "keep_bones_in_front", lambda _context, bones: drawn.append(bones))
+    monkeypatch.setattr(module, "draw_picture", lambda picture, look: drawn.append((picture, look.erases)))
+    module.erase_behind(context(shading="RENDERED"), "humans")
+    assert drawn[0] is people.overlay.reading(context(shading="RENDERED")).bones
+    assert drawn[1] == ("humans", True)
+
+
+def region_after(region: int, show_overlays: bool = True) -> SimpleNamespace:
+    """The context of a handler after the overlays of an engine's view."""
+    space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=show_overlays))
+    return SimpleNamespace(region=SimpleNamespace(as_pointer=lambda: region), space_data=space)
+
+
+@pytest.mark.any_blender
+def test_overlays_are_erased_once_for_each_drawing_of_the_regions_view(monkeypatch):
+    drawn, erased = {7: "humans", 8: "others"}, []
+    monkeypatch.setattr(engine.viewport, "below_overlays", drawn)
+    monkeypatch.setattr(engine, "shows_humans", lambda _context: False)
+    monkeypatch.setattr(module, "erase_behind", lambda _context, humans: erased.append(humans))
+    for around in (region_after(7), region_after(7), region_after(8, show_overlays=False), region_after(9)):
+        monkeypatch.setattr(engine, "bpy", SimpleNamespace(context=around))
+        engine._draw_humans()
+    assert erased == ["humans"]
+    assert not drawn
+
+
 def drawing(monkeypatch, march) -> list[tuple]:
     """Let an overlay march by this function; the parts and pictures that it draws."""
     drawn = []
