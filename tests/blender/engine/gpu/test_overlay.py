@@ -51,6 +51,9 @@ def people(addon, tmp_path, monkeypatch):
     """Two humans whose volumes viewports hide, and the scene's overlay."""
     uploads = Uploads()
     monkeypatch.setattr(scene_reading, "gpu_humans", lambda: uploads)
+    monkeypatch.setattr(
+        scene_reading, "READING_S", 60.0
+    )  # on a busy machine two humans take longer than the usual time
     found = []
     for seed, (name, x) in enumerate((("Anna", 0.0), ("Bert", 1.0))):
         human = build_human(addon, synthetic_shape.write(tmp_path / name, 12, seed), name)
