@@ -53,7 +53,7 @@ def people(addon, tmp_path, monkeypatch):
     monkeypatch.setattr(scene_reading, "gpu_humans", lambda: uploads)
     monkeypatch.setattr(
         scene_reading, "READING_S", 60.0
-    )  # on a busy machine two humans take longer than the usual time
+    )  # two humans take longer on a busy machine
     found = []
     for seed, (name, x) in enumerate((("Anna", 0.0), ("Bert", 1.0))):
         human = build_human(addon, synthetic_shape.write(tmp_path / name, 12, seed), name)
