@@ -51,9 +51,7 @@ def people(addon, tmp_path, monkeypatch):
     """Two humans whose volumes viewports hide, and the scene's overlay."""
     uploads = Uploads()
     monkeypatch.setattr(scene_reading, "gpu_humans", lambda: uploads)
-    monkeypatch.setattr(
-        scene_reading, "READING_S", 60.0
-    )  # two humans take longer on a busy machine
+    monkeypatch.setattr(scene_reading, "READING_S", 60.0)  # two humans take longer on a busy machine
     found = []
     for seed, (name, x) in enumerate((("Anna", 0.0), ("Bert", 1.0))):
         human = build_human(addon, synthetic_shape.write(tmp_path / name, 12, seed), name)
