@@ -4,8 +4,8 @@
     primdiffusion train --start-from start.safetensors --data people --run runs/next
 
 People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
-for the closed form alone. The network over person components goes: its components
-are others now. The local network keeps its weights for what has not changed.
+for the closed form alone. The network over person components goes: its components are others now. The local network
+keeps its weights for what has not changed.
 """
 
 from __future__ import annotations

@@ -195,6 +195,9 @@ def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
     assert torch.allclose(sign * heads, torch.tensor([1.0, 3.0]).expand(3, -1), rtol=0.1)
     assert sign * dress[4] == pytest.approx(2.0, rel=0.1)
     assert jeans[4].abs() < 0.2
+    g = part(mixture, **DRESS, hair="bob", shoes="boots")[0]
+    own = variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[4]
+    assert own < 0.1, "the tone is in the shared direction alone: else dress and face would differ"
     assert mixture.axes.shape == (5, 4, CLOTHES)
     assert mixture.head_axes.shape == (3, 2, 2)
 
