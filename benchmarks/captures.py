@@ -39,7 +39,7 @@ from primdiffusion.capture.coco import write_coco
 from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.reader import Captures, Subject, open_captures
+from primdiffusion.capture.reader import Captures, Subject, body_joints, joints_of, open_captures
 from primdiffusion.capture.render import (
     JPEG_QUALITY,
     RenderJob,
@@ -49,7 +49,6 @@ from primdiffusion.capture.render import (
     srgb_bytes,
     write_parameters,
 )
-from primdiffusion.capture.sheet import body_joints, joints_of
 from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import Assets, open_assets

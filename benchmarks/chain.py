@@ -66,7 +66,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.regions import region_of
 from primdiffusion.evaluation.image_metrics import overlap, ssim
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.payloads import head_centre, make_payloads, rest_frames
 from primdiffusion.people.wardrobe import required_meshes

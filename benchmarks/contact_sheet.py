@@ -21,7 +21,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours

@@ -46,7 +46,7 @@ from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoi
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import place
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.payloads import rest_frames

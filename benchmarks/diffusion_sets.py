@@ -11,7 +11,7 @@ import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.formats import requests
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh

@@ -21,14 +21,13 @@ from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.editing.inpaint import harmonise, inpaint
+from primdiffusion.editing.inpaint import harmonise, inpaint, transfer_garment, transfer_texture
 from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import DISJOINT, region_of
-from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, Sampling
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.render.march import march
 from primdiffusion.runtime.device import best_device

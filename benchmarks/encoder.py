@@ -58,7 +58,7 @@ from primdiffusion.evaluation.reconstruction import (
 )
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes

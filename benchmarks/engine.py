@@ -30,8 +30,8 @@ from march_people import checkered_human, generated
 from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
 from primdiffusion.human_file import save_human
 from primdiffusion.render.march import march

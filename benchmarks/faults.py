@@ -55,7 +55,7 @@ ATTACKS = (
     "test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file",
     "tests/backend/runtime/test_failures.py::test_no_terminal_escape_of_a_file_is_in_a_sentence",
     "tests/backend/runtime/test_failures.py::test_the_command_line_prints_no_escape",
-    "tests/backend/files/test_folder_lock.py::test_a_link_in_place_of_the_lock_is_named_and_its_target_stays",
+    "tests/backend/training/test_run_folder_lock.py::test_a_link_in_place_of_the_lock_is_named_and_its_target_stays",
     "tests/backend/training/test_run_folder.py::test_nothing_is_written_through_a_link_in_a_strangers_run_folder",
     "tests/blender/scene/test_blend_values.py::test_a_record_is_parsed_once_however_often_panels_draw",
     "tests/blender/scene/test_proxy_export.py::test_textures_are_not_written_through_a_link",

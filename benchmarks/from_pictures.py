@@ -64,7 +64,7 @@ from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation.distances import cubic_kernel, kernel_distance
 from primdiffusion.evaluation.image_metrics import ssim
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people

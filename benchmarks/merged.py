@@ -20,7 +20,7 @@ import psutil
 import torch
 from mathutils import Matrix
 from primdiffusion.body.model import BodyPose
-from primdiffusion.commands import merge as commands
+from primdiffusion.commands import export as commands
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.requests import DENSITY_GAIN, MergeRequest, PosedPerson

@@ -28,7 +28,7 @@ from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry import image
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh

@@ -55,8 +55,8 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.wardrobe import required_meshes

@@ -29,7 +29,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import ENCODER_VIEWS, split_cameras
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people

@@ -32,7 +32,7 @@ from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import default_body
 from primdiffusion.editing import reshaping
 from primdiffusion.evaluation.image_metrics import psnr
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_human
 from primdiffusion.render.march import march

@@ -34,7 +34,7 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.files.whole_files import written_whole
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
 from primdiffusion.training.cells import CellTask, prepare

@@ -40,8 +40,8 @@ from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.built_in import built_in_vectors
 from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.base_mesh import load_base_mesh

@@ -28,8 +28,8 @@ from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
 from primdiffusion.files.whole_files import written_whole
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Frames, Payload, Primitives
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save

@@ -16,13 +16,11 @@ from typing import TYPE_CHECKING, Any
 from primdiffusion.version import __version__
 
 if TYPE_CHECKING:
-    from primdiffusion.body.model import BodyPose
-    from primdiffusion.body.pose_file import read_pose
+    from primdiffusion.body.model import BodyPose, read_pose
     from primdiffusion.diffusion.checkpoint import load_checkpoint
-    from primdiffusion.editing.inpaint import inpaint
+    from primdiffusion.editing.inpaint import inpaint, transfer_garment, transfer_texture
     from primdiffusion.editing.interpolate import interpolate
     from primdiffusion.editing.regions import region_of
-    from primdiffusion.editing.transfer import transfer_garment, transfer_texture
     from primdiffusion.editing.vary import vary
     from primdiffusion.geometry.camera import Camera
     from primdiffusion.human import Human, framing, generate, place
@@ -45,7 +43,7 @@ __all__ = [
 _MODULES = {
     "load_checkpoint": "diffusion.checkpoint",
     "generate": "human",
-    "read_pose": "body.pose_file",
+    "read_pose": "body.model",
     "place": "human",
     "framing": "human",
     "march": "render.march",
@@ -53,8 +51,8 @@ _MODULES = {
     "interpolate": "editing.interpolate",
     "region_of": "editing.regions",
     "inpaint": "editing.inpaint",
-    "transfer_texture": "editing.transfer",
-    "transfer_garment": "editing.transfer",
+    "transfer_texture": "editing.inpaint",
+    "transfer_garment": "editing.inpaint",
     "person_in_pictures": "reconstruction.from_pictures",
     "reconstruct": "reconstruction.from_captures",
     "save_human": "human_file",

@@ -39,7 +39,7 @@ COMMANDS = {
     "info": "Describe this installation, a checkpoint or a human, as JSON",
     "people": "Make dressed, rigged humans (glTF) from a MakeHuman asset folder",
     "payloads": "Make primitives to train on, of such humans or captures",
-    "captures": "Multi-view captures: render, sheet, export, coco, farm",
+    "captures": "Multi-view captures: render, export, coco, farm",
     "fit": "Train the encoder on captures: from images to primitives",
     "train": "Train the diffusion model on primitives",
     "evaluate": "Evaluate trained models",
@@ -47,7 +47,7 @@ COMMANDS = {
 }
 """Commands and their summaries."""
 PROGRAMS = {
-    "serve": "serve.server",
+    "serve": "serve",
     "captures": "commands.captures",
     "fit": "training.fit",
     "train": "training.diffuse",

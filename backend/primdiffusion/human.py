@@ -23,8 +23,7 @@ from torch import Tensor
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.conditioning import Attributes
-from primdiffusion.diffusion.model import DiffusionModel, sample
-from primdiffusion.diffusion.reading import unfollowed
+from primdiffusion.diffusion.model import DiffusionModel, sample, unfollowed
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.formats import requests

@@ -14,7 +14,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import look_at
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, generate, render
 
 from .shrink import save_jpeg

@@ -14,7 +14,7 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.commands import info
 from primdiffusion.formats.schema import FieldError
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.render.march import RELEASED, march

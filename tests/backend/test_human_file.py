@@ -11,7 +11,7 @@ import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.human_file import load_human, save_body, save_human
 from primdiffusion.primitives.anchors import default_anchors

@@ -6,7 +6,7 @@ import torch
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.geometry.camera import look_at
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
 from voxel_baseline import (

@@ -29,7 +29,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from primdiffusion.body.pose_file import read_pose
+from primdiffusion.body.model import read_pose
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.capture.people_files import read_person as read_glb
 from primdiffusion.diffusion.checkpoint import load_checkpoint

@@ -20,7 +20,7 @@ SMALL = camera_rig.Rig(count=7, width=40, height=60)
 
 
 def test_the_extension_imports_the_backends_formats_and_nothing_else_of_it():
-    torch_alone = {"files.folder_lock", "files.tensor_file", "files.torch_file"}
+    torch_alone = {"files.tensor_file", "files.torch_file"}
     paths = [path for room in ("files", "formats") for path in (BACKEND / room).glob("[a-z]*.py")]
     names = sorted({f"{path.parent.name}.{path.stem}" for path in paths} - torch_alone)
     program = f"""

@@ -1,7 +1,7 @@
 """Frames that both programs map."""
 
 import pytest
-from primdiffusion.commands.frame_drawer import map_frame
+from primdiffusion.commands.render import map_frame
 
 from blender_primdiffusion.engine.drawing_child import SharedFrames
 

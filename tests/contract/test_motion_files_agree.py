@@ -8,7 +8,7 @@ import torch
 from blender_primdiffusion.formats.poses import files
 from blender_primdiffusion.formats.poses.rigs import RIGS
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle
-from primdiffusion.body.pose_file import read_motion, read_pose
+from primdiffusion.body.model import read_motion, read_pose
 from support.errors import refused
 
 FRAMES = 4

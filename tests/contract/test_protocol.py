@@ -201,7 +201,7 @@ def test_shutdown_is_answered_and_ends_the_child(own_child):
 
 NOISY = """
 import os, threading, time
-import primdiffusion.serve.server as serve
+import primdiffusion.serve as serve
 
 def babble():
     while True:
@@ -230,7 +230,7 @@ def test_stray_prints_and_writes_go_to_stderr_and_never_into_the_conversation(ch
 
 
 def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
-    breaking = "import sys; sys.modules['torch'] = None; import primdiffusion.serve.server as serve; serve.main()"
+    breaking = "import sys; sys.modules['torch'] = None; import primdiffusion.serve as serve; serve.main()"
     child = Conversation(("-c", breaking))
     assert child.ask(1, "hello")["result"]["name"] == "primdiffusion"
     problem = child.until(lambda m: m.get("method") == "ready")["params"]["problem"]
@@ -244,7 +244,7 @@ def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
 
 FAILING = """
 import torch
-import primdiffusion.human as human, primdiffusion.serve.server as server
+import primdiffusion.human as human, primdiffusion.serve as server
 
 def fail(model, seeds, *_):
     if seeds == [1]:

@@ -16,17 +16,18 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from PIL import Image
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.capture.composed import composed_path, drawn_box, uncovered, write_composed
-from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.capture.sheet import joints_from_body, joints_of
+from primdiffusion.capture.reader import Captures, Subject, joints_from_body, joints_of
+from primdiffusion.capture.render import JPEG_QUALITY, srgb_bytes
 from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.files.whole_files import replacing
@@ -34,6 +35,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.raster.textures import LINEAR_OF_BYTE
 
 ANNOTATIONS_FILE = "annotations.json"
 PASSES = ("img", "mask", "depth")
@@ -335,3 +337,77 @@ def _separated(lines: Iterator[str]) -> Iterator[str]:
     """Lines of a JSON list."""
     for number, line in enumerate(lines):
         yield f",\n{line}" if number else line
+
+
+FOLDER = "composed"
+"""Folder of composed images, in that of the captures."""
+
+
+def composed_path(subject: Subject, frame: int, camera: int) -> Path:
+    """Path of a composed image, whose first human is `subject`."""
+    root = subject.folder.parent
+    return capture_layout.picture_path(root / FOLDER / subject.name, "img", camera, frame)
+
+
+def write_composed(
+    images: Sequence[UInt8[np.ndarray, "h w 3"]],
+    shares: Float32[np.ndarray, "n h w"],
+    box: Box,
+    subject: Subject,
+    frame: int,
+    camera: int,
+) -> None:
+    """Write an image of all humans in a view, of whom `subject` is the first, over black, atomically.
+
+    `images` and their `uncovered` shares are of the box alone. Raises FileError, OSError where the file cannot be
+    written, or lies behind a link out of the captures.
+    """
+    path, view = composed_path(subject, frame, camera), subject.views[camera]
+    image = np.zeros((view.height, view.width, 3), np.uint8)
+    image[box] = compose(images, shares)
+    with replacing(path, subject.folder.parent) as partial:
+        Image.fromarray(image).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+
+
+Box = tuple[slice, slice]
+"""Rows and columns of a picture."""
+
+
+def drawn_box(pictures: Sequence[UInt8[np.ndarray, "H W ..."]]) -> Box:
+    """The smallest box around all pixels of images and masks that are not 0: there are no humans outside of it."""
+    rows = _extent([picture.reshape(len(picture), -1).max(1) for picture in pictures])
+    highest = [picture[rows].max(0, initial=0) for picture in pictures]
+    return rows, _extent([of_column.reshape(len(of_column), -1).max(1) for of_column in highest])
+
+
+def _extent(values: Sequence[UInt8[np.ndarray, "n"]]) -> slice:
+    """From the first to the last place at which one of the values is not 0."""
+    (places,) = np.nonzero(np.max(values, axis=0))
+    return slice(places[0], places[-1] + 1) if len(places) else slice(0)
+
+
+def uncovered(
+    masks: Sequence[UInt8[np.ndarray, "H W"]], depths: Sequence[UInt16[np.ndarray, "H W"]], distances: Sequence[float]
+) -> Float32[np.ndarray, "n H W"]:
+    """The share of each pixel that nearer humans leave to each human.
+
+    `distances` are the depths of the hips, metres, for pixels of a mask without a depth: edges.
+    """
+    depth, mask = np.stack(depths), np.stack(masks)
+    place = np.where(depth > 0, depth * DEPTH_UNIT, np.reshape(distances, (-1, 1, 1)))
+    order = place.argsort(0, kind="stable")
+    left = (1 - np.take_along_axis(mask, order, 0).astype(np.float32) / 255).cumprod(0)
+    shares = np.ones(mask.shape, np.float32)
+    np.put_along_axis(shares, order[1:], left[:-1], 0)
+    return shares
+
+
+def compose(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], shares: Float32[np.ndarray, "n H W"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw all humans in linear light, nearer over farther; colours are premultiplied over black.
+
+    `shares` are those of `uncovered`.
+    """
+    layers = zip(shares, images, strict=True)
+    return srgb_bytes(np.sum([share[..., None] * LINEAR_OF_BYTE[image] for share, image in layers], axis=0))

@@ -23,11 +23,12 @@ from primdiffusion.capture.reader import (
     Views,
     as_camera,
     full_window,
+    joints_from_body,
+    joints_of,
     open_captures,
     resample,
     windowed_view,
 )
-from primdiffusion.capture.sheet import joints_from_body, joints_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 

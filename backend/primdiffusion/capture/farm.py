@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-import re
 import signal
 import subprocess
 import sys
@@ -16,14 +15,13 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from primdiffusion.capture.people_files import SUBJECT_NAME
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.runtime.failures import optional_package
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
 """Options that a renderer must support: list its subjects as {"line": NAME} on marked lines, and render one."""
 MARK = "PRIMDIFFUSION "
-_SUBJECT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
-"""No option and no path: it is handed to another program."""
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
 _NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)
@@ -75,7 +73,7 @@ def subjects_of(command: Sequence[str]) -> list[str]:
     names: list[str] = []
     for line in listed:
         name = line.get("line") if isinstance(line, dict) else line
-        if not isinstance(name, str) or not _SUBJECT.fullmatch(name):
+        if not isinstance(name, str) or not SUBJECT_NAME.fullmatch(name):
             raise ValueError(f"{command[0]} lists the subject {name!r:.80}: give its file a name of letters and digits")
         names.append(name)
     return names

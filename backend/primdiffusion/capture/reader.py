@@ -11,17 +11,20 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 from torch import Tensor
 
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
 from primdiffusion.capture.people_files import SUBJECT_NAME
-from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
+from primdiffusion.files.arrays import all_finite, read_numbers, read_pickled_bytes
 from primdiffusion.files.json_files import read_json
-from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.regular_files import FileError, as_file_error
+from primdiffusion.files.smpl_pickle import array_of_objects, as_array, load_restricted
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
+from primdiffusion.formats.poses.motion import check_motion_size
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.pictures import (
     decoded,
@@ -31,6 +34,67 @@ from primdiffusion.geometry.pictures import (
 )
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
+
+KEYS = ("global_orient", "body_pose", "betas", "transl")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SmplParameters:
+    """Shape and poses of a subject."""
+
+    theta: Float32[np.ndarray, "F n"]
+    """72 axis-angle values per frame, pelvis first."""
+    translation: Float32[np.ndarray, "F 3"]
+    """Metres."""
+    betas: Float32[np.ndarray, "B"]
+
+    def pose(self, frame: int) -> BodyPose:
+        """The pose in a frame."""
+        return BodyPose.from_axis_angle(torch.from_numpy(self.theta[frame]), torch.from_numpy(self.translation[frame]))
+
+
+def read_smpl(subject: Path) -> SmplParameters:
+    """Read the parameters in a subject's folder.
+
+    Raises:
+        FileNotFoundError: neither file exists.
+        FileError: the file is damaged or has other contents, or its pickle contains more than arrays.
+    """
+    plain, pickled = subject / SMPL_FOLDER / SMPL_PLAIN_FILE, subject / SMPL_FOLDER / SMPL_FILE
+    if plain.is_file():
+        return _checked(plain, read_numbers(plain, KEYS))
+    if pickled.is_file():
+        return _checked(pickled, _read_pickled(pickled))
+    raise FileNotFoundError(f"{plain.parent} has neither {plain.name} nor {pickled.name}: render the subject again")
+
+
+def _read_pickled(path: Path) -> dict[str, np.ndarray]:
+    """Read the dictionary from a 0-d object array, without executing code from it."""
+    pickled = read_pickled_bytes(path, "smpl")
+    with as_file_error(path, "contains no dictionary of SMPL parameters", "download it again"):
+        (content,) = array_of_objects(load_restricted(pickled, path))
+        if not isinstance(content, dict):
+            raise ValueError(f"it contains a {type(content).__name__}")
+        if missing := [key for key in KEYS if key not in content]:
+            raise FileError(path, f"lacks {missing[0]!r}", "render the subject again, or download the file again")
+        return {key: as_array(content[key]) for key in KEYS}
+
+
+def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
+    check_motion_size(path, max(values.size for values in arrays.values()))
+    frames = next(iter(arrays["global_orient"].shape), 0)
+    shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise FileError(path, f"has {name} of shape {arrays[name].shape}, not {shape}", "render the subject again")
+    betas = arrays["betas"].reshape(-1)
+    if not all(map(all_finite, arrays.values())) or not frames or arrays["betas"].ndim > 2:
+        raise FileError(path, "has no frames, or NaN or infinite values", "render the subject again")
+    return SmplParameters(
+        theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),
+        translation=arrays["transl"].astype(np.float32),
+        betas=betas.astype(np.float32),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,6 +289,44 @@ def open_captures(root: str | Path) -> Captures:
     if not names:
         raise FileNotFoundError(f"there are no finished captures in {root}: render some, or check the path")
     return Captures(root, tuple(names), about)
+
+
+def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarray, "F J 3"]:
+    """World positions of the joints from joints.npz; without it (released layout), those of the body (None: default).
+
+    Raises:
+        FileError: joints.npz is damaged, or of other frames or joints.
+    """
+    stored = _stored_joints(subject)
+    return body_joints(subject, default_body() if body is None else body) if stored is None else stored["world"]
+
+
+def joints_from_body(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
+    """World positions [F, J, 3] of a body's joints from joints.npz minus those stored of the body with its betas.
+
+    They are zero for the body whose betas are stored, whatever rig the subject has. Raises as `joints_of`.
+    """
+    stored, own = _stored_joints(subject), body_joints(subject, body)
+    return np.zeros_like(own) if stored is None else own - stored.get("fitted", stored["world"])
+
+
+def _stored_joints(subject: Subject) -> dict[str, np.ndarray] | None:
+    path = subject.folder / "joints.npz"
+    try:
+        stored = read_numbers(path, ("world",), optional=("fitted",))
+    except FileNotFoundError:
+        return None
+    for joints in stored.values():
+        if joints.shape != (subject.frames, J, 3):
+            raise FileError(path, f"has joints of shape {joints.shape} for {subject.frames} frames", "render again")
+    return stored
+
+
+def body_joints(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
+    """World positions of a body's joints in the subject's shape and poses."""
+    smpl = subject.smpl
+    pose = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
+    return body.shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
 
 
 def as_camera(view: View) -> Camera:

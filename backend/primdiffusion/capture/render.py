@@ -5,7 +5,6 @@ Textured meshes are drawn by the rasteriser; whatever is a `Renderable` can be c
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import math
@@ -33,6 +32,7 @@ from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.rasterise import Draw
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
+from primdiffusion.runtime.device import fixed_threads
 from primdiffusion.runtime.failures import describe
 from primdiffusion.runtime.worker_process import each
 
@@ -84,7 +84,7 @@ def set_up_capture(person: Renderable, poses: BodyPose, rig: Rig | Sequence[View
     Raises:
         ValueError: the human cannot be drawn; the poses are not finite.
     """
-    with _one_thread():
+    with fixed_threads(1):  # files do not depend on the number of workers
         shaped = person.body.to(dtype=torch.float64).shape(torch.from_numpy(person.betas).double())
         body = shaped.pose(poses.to(dtype=torch.float64))
     skinning, joints = body.skinning.numpy(), body.joints[..., :3, 3].numpy()
@@ -126,17 +126,6 @@ def set_up_together(
     moves, corners = stand_together(np.array(pelvis), np.array(extents), rng)
     moved = BodyPose(own_poses[own].joint_rotation, torch.from_numpy(moves[own]).to(poses.translation))
     return set_up_capture(people[own], moved, rig.views(*bounding_sphere(corners)))
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Fix the order of summation, so that files do not depend on the number of workers."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def write_parameters(subject: Path, setup: CaptureSetup) -> None:

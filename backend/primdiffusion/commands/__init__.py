@@ -20,7 +20,7 @@ FUNCTIONS = {
     "export": "export:export",
     "proxy": "export:proxy",
     "gaussians": "export:gaussians",
-    "merge": "merge:merge",
+    "merge": "export:merge",
     "info": "info:info",
     "attributes": "info:attributes",
     "people": "people:people",

@@ -1,4 +1,4 @@
-"""Multi-view captures: `primdiffusion captures` render, sheet, export, coco and farm."""
+"""Multi-view captures: `primdiffusion captures` render, export, coco and farm."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from typing import Annotated
 import tyro
 from tqdm import tqdm
 
-from primdiffusion.body.model import BodyPose
-from primdiffusion.body.pose_file import read_motion
+from primdiffusion.body.model import BodyPose, read_motion
 from primdiffusion.capture.camera_files import Project, export_cameras
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, write_coco
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
-from primdiffusion.capture.sheet import draw_sheet
 from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
 from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
 from primdiffusion.files.regular_files import printable
@@ -150,28 +148,6 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 @dataclasses.dataclass(frozen=True)
-class SheetOfCaptures:
-    """Draw a contact sheet of views, every other one with the joints."""
-
-    root: tyro.conf.Positional[Path]
-    """Folder of a capture dataset."""
-    out: Path
-    """Output PNG."""
-    rows: int = 8
-    """Number of subjects, each in the next pose."""
-    columns: int = 12
-    """Number of cameras, evenly spaced."""
-    size: int = 160
-    """Height of an image on the sheet, pixels."""
-
-    def run(self) -> None:
-        """Draw; print the path."""
-        captures = open_captures(self.root)
-        draw_sheet(captures, self.out, self.rows, self.columns, self.size)
-        print(self.out)
-
-
-@dataclasses.dataclass(frozen=True)
 class ExportCaptures:
     """Write camera files of NeRF (transforms.json), OpenCV and COLMAP beside the images."""
 
@@ -233,7 +209,6 @@ class FarmCaptures(Farm):
 
 Command = (
     Annotated[RenderCaptures, tyro.conf.subcommand("render")]
-    | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
     | Annotated[ExportCaptures, tyro.conf.subcommand("export")]
     | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]
     | Annotated[FarmCaptures, tyro.conf.subcommand("farm")]

@@ -11,8 +11,7 @@ from typing import Annotated, Any
 import tyro
 from tqdm import tqdm
 
-from primdiffusion.body.model import BodyPose
-from primdiffusion.body.pose_file import read_motion
+from primdiffusion.body.model import BodyPose, read_motion
 from primdiffusion.capture.coco import JOINTS
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures

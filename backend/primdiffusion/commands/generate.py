@@ -23,8 +23,7 @@ from primdiffusion.commands.output import (
 )
 from primdiffusion.commands.progress import Pace, ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
-from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.reading import warnings_of
+from primdiffusion.diffusion.model import DiffusionModel, warnings_of
 from primdiffusion.diffusion.samplers import RELEASED_END, SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
-from primdiffusion.capture.smpl_parameters import read_smpl
+from primdiffusion.capture.reader import read_smpl
 from primdiffusion.commands.options import ImportReleasedCommand
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session

@@ -28,7 +28,7 @@ from primdiffusion.files.regular_files import remove_file
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import Compositing
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_body, save_human
 from primdiffusion.primitives.primitives import K, Payload, Primitives, S

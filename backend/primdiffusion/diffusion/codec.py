@@ -19,11 +19,22 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.anchors import CHARTS, default_anchors
-from primdiffusion.primitives.primitives import GRID, WINDOW_POWER, WINDOW_SHARPNESS, K, Payload, S
-from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, DELTA_SCALE_UNIT, NETWORK_SCALE, pack, unpack
+from primdiffusion.primitives.primitives import (
+    CHANNELS_PER_LAYER,
+    DELTA_SCALE_UNIT,
+    GRID,
+    NETWORK_SCALE,
+    WINDOW_POWER,
+    WINDOW_SHARPNESS,
+    K,
+    Payload,
+    S,
+    pack,
+    unpack,
+)
 
 VOXEL_VALUES = 4 * S**3
 VALUES = VOXEL_VALUES + 3

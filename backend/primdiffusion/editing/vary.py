@@ -7,8 +7,7 @@ from types import MappingProxyType
 
 import torch
 
-from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.reading import unfollowed
+from primdiffusion.diffusion.model import DiffusionModel, unfollowed
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
     OnStep,

@@ -24,8 +24,8 @@ from primdiffusion.encoder.blocks import (
 )
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.unproject import SIDE, Unprojected
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import GRID, Payload, S
 
 MOTION = 3 * (J - 1)

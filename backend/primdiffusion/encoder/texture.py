@@ -19,7 +19,7 @@ from torch.nn import functional
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.unproject import SIDE, TOLERANCE, Unprojected, body_depth, check
-from primdiffusion.geometry.srgb import to_bytes
+from primdiffusion.geometry.image import to_bytes
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.primitives import K

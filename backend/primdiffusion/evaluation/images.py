@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,8 @@ from primdiffusion.capture.coco import JOINTS
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.pictures import opened_picture
-from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
@@ -194,3 +194,9 @@ def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Ten
     if values.shape[:2] == size:
         return values
     return functional.interpolate(values.movedim(-1, 0)[None], size, mode="bicubic", antialias=True)[0].movedim(0, -1)
+
+
+def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of texts."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
+    return "\n".join([lines[0], "|---" * len(headings) + "|", *lines[1:]])

@@ -19,8 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
-from primdiffusion.evaluation.images import SIDE, TestImage
-from primdiffusion.evaluation.markdown import markdown_table
+from primdiffusion.evaluation.images import SIDE, TestImage, markdown_table
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
     cell_means,

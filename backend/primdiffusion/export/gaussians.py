@@ -21,8 +21,8 @@ from torch import Tensor
 from primdiffusion.export.surface import depth_below
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.requests import GaussiansRequest
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
 from primdiffusion.render.merge import merge
 

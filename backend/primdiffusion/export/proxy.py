@@ -19,7 +19,7 @@ from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import VOXEL, ProxySettings
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 from primdiffusion.human import Human, body_of, place, sole_height
 from primdiffusion.people.gltf import Skeleton, glb

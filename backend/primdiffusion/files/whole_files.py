@@ -41,7 +41,7 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 def remove_abandoned(folder: Path, of: Path | None = None, after_s: float = ABANDONED_AFTER_S) -> None:
     """Remove what killed processes left in a folder, only what was to become `of` if given. Raises no OSError.
 
-    Who holds the folder alone (`folder_lock`) knows that no other process writes there: `after_s` is 0 then.
+    Who holds the folder alone (`lock_folder`) knows that no other process writes there: `after_s` is 0 then.
     """
     for path, named in _temporary_files(folder):
         if of is None or (named["stem"], named["suffix"] or "") == (of.stem, of.suffix):

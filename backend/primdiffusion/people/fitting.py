@@ -22,9 +22,8 @@ from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
 
 from primdiffusion.geometry.textured_mesh import TexturedPart, vertex_normals
-from primdiffusion.people.assets import Assets
+from primdiffusion.people.assets import Assets, ObjMesh, Proxy
 from primdiffusion.people.base_mesh import BaseMesh
-from primdiffusion.people.mhclo import ObjMesh, Proxy
 from primdiffusion.people.wardrobe import SKIRTS, Garment
 
 JOINTS = 24

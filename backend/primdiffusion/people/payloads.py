@@ -36,7 +36,7 @@ from primdiffusion.files.arrays import read_arrays, write_deflated
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.requests import Making
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import encode_srgb, to_bytes
+from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh

@@ -20,7 +20,7 @@ from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.arrays import LARGEST_NUMBER, array_shape, read_arrays
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S
 

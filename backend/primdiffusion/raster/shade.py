@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Float64, Int32
 
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.raster.textures import Textures, gather_textures, texels_around
 from primdiffusion.raster.z_buffer import AlphaTest, barycentrics, project, z_buffer

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 
 ALPHA_TEST = 128

@@ -32,7 +32,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames, frames_of
 from primdiffusion.formats import requests
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.reconstruction.posture_fit import each

@@ -16,7 +16,6 @@ import torch
 from jaxtyping import UInt8
 
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.capture.cut_out import load_opencv
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Views, as_camera
@@ -25,7 +24,7 @@ from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error, resized
-from primdiffusion.reconstruction.posture_masks import cut_by_outline, outline_in, without_things
+from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
 from primdiffusion.reconstruction.posture_start import (
     STANDING_ARMS,

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.reconstruction.from_captures import PersonComponents

@@ -17,8 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.body.pose_file import read_motion
+from primdiffusion.body.model import BodyPose, default_body, read_motion
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph
 from primdiffusion.capture.reader import as_camera, windowed_view
@@ -163,7 +162,7 @@ class PostureFile:
 
 
 def read_posture(path: Path, sizes: Sequence[tuple[int, int]]) -> PostureFile:
-    """Read a pose file (`primdiffusion.body.pose_file`) or a posture of pictures of `sizes` (width, height).
+    """Read a pose file (`primdiffusion.body.model`) or a posture of pictures of `sizes` (width, height).
 
     Raises FileNotFoundError, and ValueError for what is no pose or of another rig; the message names the file.
     """

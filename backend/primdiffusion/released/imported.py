@@ -29,7 +29,7 @@ from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import released_half_extent
 from primdiffusion.primitives.body_setup import BodySetup
-from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
+from primdiffusion.primitives.primitives import RELEASED_FULL_DENSITY
 
 SCHEDULE = "sqrt_linear"
 """Name of the released schedule in `SCHEDULES`."""

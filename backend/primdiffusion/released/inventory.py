@@ -16,8 +16,7 @@ from torch import Tensor
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet, UNetConfig
 from primdiffusion.files.tensor_file import under
-from primdiffusion.primitives.primitives import S
-from primdiffusion.primitives.slab import CHANNELS_PER_LAYER
+from primdiffusion.primitives.primitives import CHANNELS_PER_LAYER, S
 from primdiffusion.released import stage_one
 from primdiffusion.released.imported import SCHEDULE
 from primdiffusion.released.reading import Account, TensorEntry

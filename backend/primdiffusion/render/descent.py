@@ -20,7 +20,7 @@ from torch import Tensor
 from primdiffusion.formats.requests import Count, NotNegative, RayStep
 from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cuda.graph import Recorded

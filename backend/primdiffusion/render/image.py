@@ -14,8 +14,8 @@ from torch import Tensor
 
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.primitives.primitives import Frames
 
 Background = tuple[float, float, float]

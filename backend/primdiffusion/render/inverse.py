@@ -25,7 +25,7 @@ from torch import Tensor
 
 from primdiffusion.formats.requests import Count, NotNegative
 from primdiffusion.formats.schema import Checked
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.primitives.primitives import Payload, Primitives, S
 from primdiffusion.render.cpu.linear import (
     ColourMatrix,

@@ -13,8 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.image import Image
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import Image, decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.z_buffer import NearestTriangle, nearest_triangles
 

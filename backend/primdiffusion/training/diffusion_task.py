@@ -12,7 +12,7 @@ from torch import nn
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.files.picture_files import write_png
 from primdiffusion.formats import requests
-from primdiffusion.geometry.srgb import encode_srgb, to_bytes
+from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.runtime.device import has_bfloat16

@@ -23,7 +23,7 @@ from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.picture_files import write_png
-from primdiffusion.geometry.srgb import encode_srgb, to_bytes
+from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig

@@ -15,7 +15,7 @@ from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.people.stored_people import PersonFolder, payload_of_bytes
-from primdiffusion.primitives.slab import pack
+from primdiffusion.primitives.primitives import pack
 from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import smplx
 import torch
-from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.body.pose_file import pose_from_numbers, read_pose
+from primdiffusion.body.model import BodyModel, BodyPose, J, default_body, pose_from_numbers, read_pose
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.people.base_mesh import load_base_mesh

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from capture_scenes import captured
-from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.body.pose_file import read_motion
+from primdiffusion.body.model import BodyPose, default_body, read_motion
 from primdiffusion.capture.camera_files import export_cameras
 from primdiffusion.capture.poses import built_in_poses, choose_poses
 from primdiffusion.capture.reader import open_captures

@@ -185,7 +185,7 @@ def test_the_face_is_that_of_the_whole_body(bodies):
         moved = dataclasses.replace(subject, smpl=dataclasses.replace(subject.smpl, betas=betas))
         joints = np.stack([posed.joints[:, :3, 3].numpy() for posed in poses])
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("primdiffusion.capture.sheet._stored_joints", lambda _, joints=joints: {"world": joints})
+            patch.setattr("primdiffusion.capture.reader._stored_joints", lambda _, joints=joints: {"world": joints})
             np.testing.assert_allclose(keypoints_of(moved)[:, : len(FACE)], face, rtol=0, atol=1e-12)
 
 

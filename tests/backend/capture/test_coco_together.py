@@ -9,8 +9,7 @@ import torch
 from capture_scenes import decoded, small_job
 from PIL import Image
 from primdiffusion import cli
-from primdiffusion.capture.coco import KEYPOINTS, groups, write_coco
-from primdiffusion.capture.composed import compose, drawn_box, uncovered
+from primdiffusion.capture.coco import KEYPOINTS, compose, drawn_box, groups, uncovered, write_coco
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import built_in_poses, turned
 from primdiffusion.capture.reader import open_captures
@@ -19,7 +18,7 @@ from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.group_places import GAP, places
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.raster.textures import LINEAR_OF_BYTE
 from support.errors import refused
 

@@ -18,9 +18,8 @@ from primdiffusion.capture.conditioning import (
     default_betas,
     spread_cameras,
 )
-from primdiffusion.capture.reader import Subject, open_captures
+from primdiffusion.capture.reader import SmplParameters, Subject, open_captures
 from primdiffusion.capture.render import render
-from primdiffusion.capture.smpl_parameters import SmplParameters
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.capture_layout import picture_path, write_npz, write_smpl

@@ -9,9 +9,8 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.reader import body_joints, open_captures
 from primdiffusion.capture.render import set_up_capture
-from primdiffusion.capture.sheet import body_joints, draw_sheet
 from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
@@ -157,13 +156,6 @@ def test_no_captures_are_no_captures(tmp_path):
         open_captures(tmp_path / "nowhere")
     with refused(FileNotFoundError, "finished"):
         open_captures(tmp_path)
-
-
-def test_a_sheet_shows_what_is_there(root, tmp_path):
-    draw_sheet(open_captures(root), tmp_path / "sheet.png", rows=6, columns=3, size=64)
-    with Image.open(tmp_path / "sheet.png") as sheet:
-        assert sheet.size == (3 * 64, 6 * 64)
-        assert np.asarray(sheet).any(-1).mean() > 0.02
 
 
 @pytest.mark.parametrize("mode", ["RGB", "LA", "RGBA"])

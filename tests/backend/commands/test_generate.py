@@ -16,7 +16,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.samplers import RELEASED_END
 from primdiffusion.formats.requests import Conditioning, GenerateRequest
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import framing, people_of, place
 from primdiffusion.human import generate as generate_human
 from primdiffusion.human_file import load_human

@@ -12,7 +12,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.reconstruct import fit_posture
 from primdiffusion.commands.session import Session
 from primdiffusion.formats.requests import FitPostureRequest
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction import from_pictures

@@ -8,10 +8,8 @@ from diffusion_people import COMPONENTS, VOCABULARY, small_model
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
-from primdiffusion.diffusion.model import DiffusionModel, sample
-from primdiffusion.diffusion.model_card import model_card
-from primdiffusion.diffusion.pretrained import save_pretrained
-from primdiffusion.diffusion.reading import unfollowed, warnings_of
+from primdiffusion.diffusion.model import DiffusionModel, sample, unfollowed, warnings_of
+from primdiffusion.diffusion.pretrained import model_card, save_pretrained
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.editing.vary import vary

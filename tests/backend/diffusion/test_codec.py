@@ -15,8 +15,7 @@ from primdiffusion.diffusion.codec import (
     payload_from_cells,
 )
 from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors
-from primdiffusion.primitives.primitives import GRID, K, Payload, S
-from primdiffusion.primitives.slab import pack
+from primdiffusion.primitives.primitives import GRID, K, Payload, S, pack
 from support.errors import refused
 
 MIRROR_X = torch.tensor([-1.0, 1.0, 1.0])

@@ -7,11 +7,18 @@ import numpy as np
 import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
-from primdiffusion.drawing.compositing import NOTHING
-from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, Scene, ViewSettings, depth_span, draw, draw_in_bands
+from primdiffusion.drawing.draw import (
+    FIRST_PIXELS,
+    GROWTH,
+    NOTHING,
+    Scene,
+    ViewSettings,
+    depth_span,
+    draw,
+    draw_in_bands,
+)
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.image import Image
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import Image, encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.image import depth_colours

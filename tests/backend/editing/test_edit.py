@@ -11,10 +11,9 @@ from editing_people import anybody, slab_model
 from primdiffusion.diffusion.model import seeded
 from primdiffusion.diffusion.schedule import dense_steps, early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
-from primdiffusion.editing.inpaint import harmonise, inpaint
+from primdiffusion.editing.inpaint import harmonise, inpaint, transfer_garment, transfer_texture
 from primdiffusion.editing.interpolate import interpolate, inversion_steps, inverted, slerp
 from primdiffusion.editing.regions import region_of
-from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human

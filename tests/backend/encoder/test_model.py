@@ -29,7 +29,7 @@ from primdiffusion.encoder.unproject import unproject_voxels
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.camera import look_at
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.primitives.primitives import Frames, K, S
 from primdiffusion.render.march import march
 from safetensors import safe_open

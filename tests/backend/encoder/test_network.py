@@ -10,9 +10,8 @@ from primdiffusion.encoder.config import PRESETS, EncoderConfig, encoder_config
 from primdiffusion.encoder.model import frames_of
 from primdiffusion.encoder.network import Encoder, clamp, fill, voxels
 from primdiffusion.encoder.unproject import Unprojected
-from primdiffusion.geometry.srgb import encode_srgb
-from primdiffusion.primitives.primitives import GRID, K, Payload, S
-from primdiffusion.primitives.slab import pack
+from primdiffusion.geometry.image import encode_srgb
+from primdiffusion.primitives.primitives import GRID, K, Payload, S, pack
 from support.errors import refused
 from tiny_encoder import TINY
 

@@ -19,7 +19,7 @@ from primdiffusion.encoder.unproject import (
     unproject_voxels,
 )
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors, default_texels
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S

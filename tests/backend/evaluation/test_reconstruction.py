@@ -21,7 +21,7 @@ from primdiffusion.evaluation.reconstruction import (
     summary,
     table,
 )
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.human import pose_body
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload, Primitives

@@ -9,7 +9,7 @@ import torch
 from export_people import person
 from primdiffusion.body.model import BodyPose
 from primdiffusion.export.gaussians import PROPERTIES, gaussians_of, write_gaussians
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import framing, place
 from primdiffusion.render.march import march
 from support.errors import refused

@@ -8,15 +8,14 @@ import pytest
 import torch
 import trimesh
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.people import assets as assets_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets, recolour
 from primdiffusion.people import payloads as payloads_module
 from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
-from primdiffusion.people.assets import ENVIRONMENT_VARIABLE
+from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, parse_mhclo
 from primdiffusion.people.fitting import shown_faces, skirt_faces, under_hat, under_hem
-from primdiffusion.people.mhclo import parse_mhclo
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh

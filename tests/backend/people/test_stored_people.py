@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from diffusion_people import write_people
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
 from primdiffusion.primitives.primitives import K
 from support.errors import refused

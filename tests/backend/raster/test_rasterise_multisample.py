@@ -9,7 +9,7 @@ import trimesh
 from capture_scenes import BLUE, GREEN, RED, WHITE, box, square
 from primdiffusion.capture.reader import as_camera
 from primdiffusion.formats.camera_rig import View, look_at
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.raster.rasterise import figure_from_mesh, rasterise
 from support.errors import refused

@@ -12,7 +12,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import sample
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.reconstruction import from_captures

@@ -18,8 +18,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import framing, pose_body
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error
-from primdiffusion.reconstruction.posture_prior import deviations
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, deviations, each, outline_error
 from primdiffusion.reconstruction.posture_start import (
     before_cameras,
     cameras_of,

@@ -10,8 +10,8 @@ import torch
 from primdiffusion.capture.photograph import Photograph
 from primdiffusion.capture.reader import Window
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reconstruction.from_captures import PersonComponents

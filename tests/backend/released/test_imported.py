@@ -12,7 +12,7 @@ import safetensors.torch
 import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
+from primdiffusion.commands.render import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps

@@ -11,8 +11,7 @@ from primdiffusion.diffusion.schedule import released_steps, sqrt_linear
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.primitives.anchors import attach, build_anchors
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
-from primdiffusion.primitives.primitives import GRID, K, Payload, Primitives, S
-from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
+from primdiffusion.primitives.primitives import GRID, RELEASED_FULL_DENSITY, K, Payload, Primitives, S
 from primdiffusion.released.imported import Reference, reference_extents, rest_half_extent
 from primdiffusion.render.march import MarchSettings, march
 from released_files import save_body

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.render.image import Rendering, composite, depth_to_png
 from support.errors import refused
 

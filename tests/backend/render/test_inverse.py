@@ -8,7 +8,7 @@ import pytest
 import torch
 from march_scenes import sheet_frames
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Payload, Primitives

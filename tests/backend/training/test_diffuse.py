@@ -17,7 +17,7 @@ from diffusion_people import write_people
 from PIL import Image
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import codec_regions
-from primdiffusion.diffusion.model_card import model_card
+from primdiffusion.diffusion.pretrained import model_card
 from primdiffusion.human import generate
 from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.primitives.anchors import default_anchors

@@ -16,7 +16,7 @@ from primdiffusion.capture.reader import Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human, save_human

@@ -9,14 +9,13 @@ import pytest
 import tyro
 from accelerate import PartialState
 from diffuse_runs import make_small, settings
-from primdiffusion.files.folder_lock import lock_folder
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.runtime.failures import MissingPackageError
 from primdiffusion.training.config import PhaseConfig, TrainingConfig, check_resumable, to_json
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.run_folder import open_metrics
+from primdiffusion.training.run_folder import lock_folder, open_metrics
 from support.errors import refused
 from support.runs import rows
 

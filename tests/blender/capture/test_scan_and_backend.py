@@ -18,9 +18,8 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.coco import FACE, keypoints_of
 from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.reader import joints_of, open_captures
 from primdiffusion.capture.render import set_up_capture
-from primdiffusion.capture.sheet import joints_of
 from primdiffusion.formats import camera_rig as backend_rig
 
 from blender_primdiffusion.capture.job import run

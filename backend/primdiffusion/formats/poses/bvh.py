@@ -15,9 +15,8 @@ from ...files.regular_files import FileError, as_file_error, read_regular
 from ..joints import JOINT_NAMES
 from .motion import DEFAULT_FPS, LARGEST_NUMBER, Detected, Motion
 from .rigs import NAME_BONES, UNMATCHED, BoneMap, map_bones, retarget
-from .rotation import about_axis
+from .rotation import about_axis, is_standing, straightness
 from .skeleton import REST_JOINTS
-from .standing import is_standing, straightness
 
 LARGEST_BYTES = 64 * 2**20
 LONGEST_HIERARCHY = 2**20

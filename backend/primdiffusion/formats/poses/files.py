@@ -34,15 +34,16 @@ from .rotation import (
     about_axis,
     axis_direction,
     axis_name,
+    find_up,
     first_improper,
     from_axis_angle,
     improper_text,
     nearest,
+    pelvis_up,
     to_axis_angle,
     turn_y_up,
 )
 from .skeleton import REST_JOINTS
-from .standing import find_up, pelvis_up
 
 LARGEST_PICKLE = 64 * 2**20
 """Bytes of a .pkl."""

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..joints import JOINT_NAMES, PARENTS
-from .rotation import about_axis, between
+from .rotation import about_axis, between, is_standing
 from .skeleton import REST_JOINTS, unchain
-from .standing import is_standing
 
 _SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 RIGS: dict[str, dict[str, str]] = {

@@ -1,35 +1,25 @@
-"""Contact sheets of captures with skeletons drawn on them, to check images, cameras and poses."""
+"""A contact sheet of captures with skeletons drawn on every other view, to check images, cameras and poses.
+
+python examples/capture_sheet.py captures --out sheet.png
+"""
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw
-
-from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.files.arrays import read_numbers
-from primdiffusion.files.regular_files import FileError
-from primdiffusion.files.whole_files import replacing
+from primdiffusion.body.model import default_body
+from primdiffusion.capture.reader import Captures, Subject, joints_of, open_captures
 from primdiffusion.formats.camera_rig import View
 
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
 
 
 def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int) -> None:
-    """Write the sheet, one subject in one pose per row.
-
-    Rows cycle through the poses; every other image has the joints drawn on it.
-
-    Raises:
-        ValueError: a size is not positive.
-        FileNotFoundError, FileError: a file is missing or damaged.
-    """
-    if min(rows, columns, size) < 1:
-        raise ValueError(f"rows, columns and size are {rows}, {columns} and {size}: give 1 or more")
+    """Write the sheet, one subject in one pose per row; rows cycle through the poses."""
     lines = []
     for name, frame in _chosen(captures, rows):
         subject = captures.subject(name)
@@ -45,46 +35,7 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
         for picture in line:
             sheet.paste(picture, (left, size * row))
             left += picture.width
-    with replacing(out) as path:
-        sheet.save(path, format="PNG")
-
-
-def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarray, "F J 3"]:
-    """World positions of the joints from joints.npz; without it (released layout), those of the body (None: default).
-
-    Raises:
-        FileError: joints.npz is damaged, or of other frames or joints.
-    """
-    stored = _stored_joints(subject)
-    return body_joints(subject, default_body() if body is None else body) if stored is None else stored["world"]
-
-
-def joints_from_body(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
-    """World positions [F, J, 3] of a body's joints from joints.npz minus those stored of the body with its betas.
-
-    They are zero for the body whose betas are stored, whatever rig the subject has. Raises as `joints_of`.
-    """
-    stored, own = _stored_joints(subject), body_joints(subject, body)
-    return np.zeros_like(own) if stored is None else own - stored.get("fitted", stored["world"])
-
-
-def _stored_joints(subject: Subject) -> dict[str, np.ndarray] | None:
-    path = subject.folder / "joints.npz"
-    try:
-        stored = read_numbers(path, ("world",), optional=("fitted",))
-    except FileNotFoundError:
-        return None
-    for joints in stored.values():
-        if joints.shape != (subject.frames, J, 3):
-            raise FileError(path, f"has joints of shape {joints.shape} for {subject.frames} frames", "render again")
-    return stored
-
-
-def body_joints(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
-    """World positions of a body's joints in the subject's shape and poses."""
-    smpl = subject.smpl
-    pose = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
-    return body.shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
+    sheet.save(out)
 
 
 def _chosen(captures: Captures, rows: int) -> list[tuple[str, int]]:
@@ -123,3 +74,19 @@ def _draw_joints(picture: Image.Image, view: View, joints: Float[np.ndarray, "J 
 def _evenly(count: int, wanted: int) -> list[int]:
     """At most `wanted` of `count` indices, evenly spaced, including the first."""
     return sorted({int(i * count / min(wanted, count)) for i in range(min(wanted, count))})
+
+
+def main() -> None:
+    """Draw the sheet of the captures that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path, help="folder of a capture dataset")
+    parser.add_argument("--out", type=Path, default=Path("sheet.png"))
+    parser.add_argument("--rows", type=int, default=8, help="subjects, each in the next pose")
+    parser.add_argument("--columns", type=int, default=12, help="cameras, evenly spaced")
+    parser.add_argument("--size", type=int, default=160, help="height of an image on the sheet, pixels")
+    arguments = parser.parse_args()
+    draw_sheet(open_captures(arguments.captures), arguments.out, arguments.rows, arguments.columns, arguments.size)
+
+
+if __name__ == "__main__":
+    main()

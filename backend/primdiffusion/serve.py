@@ -257,7 +257,7 @@ class Server:
         """Import torch and what needs it; an import error becomes the error of every later request."""
         try:
             # after `hello` can be answered; the other two are loaded before the first request
-            from primdiffusion.commands import frame_drawer, output, session  # noqa: F401
+            from primdiffusion.commands import output, render, session  # noqa: F401
 
             started = session.Session()
         except Exception as e:
@@ -373,3 +373,7 @@ def _exit(status: int) -> NoReturn:
     """Exit from any thread. An ordinary exit would wait for the lock of the reader, which blocks on the pipe."""
     sys.stderr.flush()
     os._exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -5,9 +5,8 @@ import inspect
 
 import pytest
 import torch
-from primdiffusion.geometry.srgb import encode_srgb
-from primdiffusion.primitives.primitives import Payload
-from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY, pack, unpack
+from primdiffusion.geometry.image import encode_srgb
+from primdiffusion.primitives.primitives import RELEASED_FULL_DENSITY, Payload, pack, unpack
 from support.errors import refused
 
 FULL_DENSITY = 100.0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.commands import frame_drawer
-from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
+from primdiffusion.commands import render as frame_drawer
+from primdiffusion.commands.render import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.formats.requests import DrawRequest, PosedPerson

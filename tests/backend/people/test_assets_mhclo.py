@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from primdiffusion.files.regular_files import FileError
-from primdiffusion.people.assets import _decoded
-from primdiffusion.people.mhclo import parse_mhclo, parse_obj, read_pair
+from primdiffusion.people.assets import _decoded, parse_mhclo, parse_obj, read_pair
 from support.errors import refused
 
 BASE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 4, 0], [0, 0, 6], [1, 1, 1]])

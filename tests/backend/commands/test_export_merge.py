@@ -10,7 +10,7 @@ import pytest
 import torch
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
-from primdiffusion.commands import merge as commands
+from primdiffusion.commands import export as commands
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.merged_file import upright_grid

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from primdiffusion.capture.cut_out import cut_out, load_opencv
+from primdiffusion.reconstruction.posture_masks import cut_out, load_opencv
 from scipy import ndimage
 
 

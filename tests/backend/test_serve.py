@@ -7,7 +7,7 @@ import threading
 
 from hypothesis import given
 from hypothesis import strategies as st
-from primdiffusion.serve.server import RpcError, RpcRequest, Wire, parse_request
+from primdiffusion.serve import RpcError, RpcRequest, Wire, parse_request
 from support.errors import refused
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text()

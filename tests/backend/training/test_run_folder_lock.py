@@ -5,14 +5,14 @@ import sys
 from pathlib import Path
 
 from filelock import FileLock
-from primdiffusion.files.folder_lock import LOCK, lock_folder
 from primdiffusion.files.regular_files import FileError
+from primdiffusion.training.run_folder import LOCK, lock_folder
 from support.errors import refused
 
 HOLD = """
 import sys
 from pathlib import Path
-from primdiffusion.files.folder_lock import lock_folder
+from primdiffusion.training.run_folder import lock_folder
 with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

@@ -1,5 +1,0 @@
-"""`python -m primdiffusion.serve`."""
-
-from primdiffusion.serve.server import main
-
-main()
