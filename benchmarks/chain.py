@@ -64,7 +64,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.regions import region_of
-from primdiffusion.evaluation.image_metrics import overlap, ssim
+from primdiffusion.evaluation.metrics import overlap, ssim
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.people.assets import Assets, open_assets

@@ -16,7 +16,7 @@ from primdiffusion.diffusion.codec import CellCodec, cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample, seeded
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.poses.built_in import built_in_vectors
+from primdiffusion.formats.poses.motion import built_in_vectors
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, people_of

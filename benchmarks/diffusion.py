@@ -44,7 +44,7 @@ from neighbours import nearest_stored
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
+from primdiffusion.evaluation.metrics import frechet_distance, kernel_distance
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import place

@@ -47,7 +47,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
+from primdiffusion.evaluation.metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import (
     EvaluationSettings,
     Means,

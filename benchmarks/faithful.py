@@ -27,9 +27,9 @@ sys.path[:0] = [
     str(TESTS / folder) for folder in (".", "backend", "backend/released", "backend/evaluation")
 ]  # the references
 
+import test_metrics_torch_fidelity  # noqa: E402
 import test_pose_depth_network  # noqa: E402
 import test_stage_one_twin  # noqa: E402
-import test_torch_fidelity  # noqa: E402
 import test_unet_twin  # noqa: E402
 import torch  # noqa: E402
 from primdiffusion.diffusion.unet import PAPER, SlabUNet  # noqa: E402
@@ -61,8 +61,8 @@ def table_minutes(assets: Path) -> float:
 def measure(assets: Path | None) -> dict[str, float | int | None]:
     """All figures; None means not measured here."""
     with tempfile.TemporaryDirectory() as folder:
-        weights = test_torch_fidelity.save_random_inception(Path(folder) / "inception.pth")
-        fid_error = test_torch_fidelity.fid_error(weights)
+        weights = test_metrics_torch_fidelity.save_random_inception(Path(folder) / "inception.pth")
+        fid_error = test_metrics_torch_fidelity.fid_error(weights)
     return {
         "unet_error_max": max(map(test_unet_twin.unet_error, (test_unet_twin.PLAIN, test_unet_twin.ATTENTIVE))),
         "attention_twin_error_max": max(test_unet_twin.attention_error(), test_stage_one_twin.attention_error()),

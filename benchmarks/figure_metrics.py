@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from primdiffusion.evaluation.image_metrics import psnr
+from primdiffusion.evaluation.metrics import psnr
 from scipy import ndimage
 from torch import Tensor
 

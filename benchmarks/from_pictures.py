@@ -61,8 +61,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.evaluation.distances import cubic_kernel, kernel_distance
-from primdiffusion.evaluation.image_metrics import ssim
+from primdiffusion.evaluation.metrics import cubic_kernel, kernel_distance, ssim
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.human import Human, default_frames, place

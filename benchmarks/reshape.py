@@ -28,10 +28,9 @@ import bpy
 import numpy as np
 import torch
 from march_people import checkered_human
-from primdiffusion.body.measures import betas_of_measures
-from primdiffusion.body.model import default_body
+from primdiffusion.body.model import betas_of_measures, default_body
 from primdiffusion.editing import reshaping
-from primdiffusion.evaluation.image_metrics import psnr
+from primdiffusion.evaluation.metrics import psnr
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_human

@@ -38,7 +38,7 @@ from primdiffusion.capture.render import srgb_bytes
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.poses.built_in import built_in_vectors
+from primdiffusion.formats.poses.motion import built_in_vectors
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix

@@ -20,8 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.body.measures import betas_of_measures
-from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
+from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, betas_of_measures, default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import DiffusionModel, sample, unfollowed
 from primdiffusion.diffusion.samplers import SamplerStep

@@ -21,8 +21,7 @@ from pathlib import Path
 
 import torch
 
-from primdiffusion.body.measures import LARGEST_BETA
-from primdiffusion.body.model import BodyModel
+from primdiffusion.body.model import LARGEST_BETA, BodyModel
 from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError, as_file_error
 from primdiffusion.files.whole_files import written_whole

@@ -10,8 +10,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.poses.built_in import built_in_vectors
-from ..formats.poses.motion import Motion
+from ..formats.poses.motion import Motion, built_in_vectors
 from ..formats.poses.rotation import about_axis, from_axis_angle, to_axis_angle
 from ..formats.poses.skeleton import REST_JOINTS, joint_positions
 from ..scene.armature import check_joints, model_origin, pose_from_joint_rotations, rest_rotations

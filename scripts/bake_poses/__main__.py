@@ -14,7 +14,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import torch
-from blender_primdiffusion.formats.poses import built_in
+from blender_primdiffusion.formats.poses import motion
 from blender_primdiffusion.formats.poses.rotation import to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from PIL import Image
@@ -52,7 +52,7 @@ def write_json() -> None:
     for name, pose in BUILT_IN.items():
         turns = to_axis_angle(pose.rotations()).ravel() + 0.0
         lines.append(f'"{name}": [' + ", ".join(f"{value:.6g}" for value in turns) + "]")
-    built_in.FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    motion.BUILT_IN_FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
 def write_motions() -> None:

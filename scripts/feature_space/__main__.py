@@ -14,7 +14,7 @@ from pathlib import Path
 
 import tyro
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.distances import too_few_samples
+from primdiffusion.evaluation.metrics import too_few_samples
 from primdiffusion.formats.requests import Count, Sampling
 from primdiffusion.formats.schema import check
 from primdiffusion.human import generate, place

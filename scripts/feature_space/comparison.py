@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from primdiffusion.evaluation.distances import check_features, frechet_distance, kernel_distance
 from primdiffusion.evaluation.images import markdown_table
+from primdiffusion.evaluation.metrics import check_features, frechet_distance, kernel_distance
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.stored_people import find_people
 from primdiffusion.training.latents import split_people

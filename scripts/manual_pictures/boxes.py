@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from primdiffusion.body.measures import betas_of_measures
-from primdiffusion.body.model import default_body
+from primdiffusion.body.model import betas_of_measures, default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import look_at

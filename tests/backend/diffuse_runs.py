@@ -9,7 +9,7 @@ import pytest
 from accelerate.state import AcceleratorState
 from diffusion_people import SMALL
 from primdiffusion.diffusion.unet import UNetConfig
-from primdiffusion.training import diffusion_task, losses, slabs
+from primdiffusion.training import diffusion_task, losses
 from primdiffusion.training.config import CodecConfig, PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import train
 from support.runs import rows
@@ -25,7 +25,7 @@ def make_small(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(diffusion_task, "WIDTH", 24)
     patch.setattr(diffusion_task, "HEIGHT", 40)
     patch.setattr(diffusion_task, "STEP", 0.03)
-    patch.setattr(slabs, "x0_errors", functools.partial(losses.x0_errors, levels=(500,)))
+    patch.setattr(diffusion_task, "x0_errors", functools.partial(losses.x0_errors, levels=(500,)))
     patch.setattr(diffusion_task, "write_samples", functools.partial(diffusion_task.write_samples, seeds=(0,), steps=1))
     AcceleratorState._reset_state(reset_partial_state=True)
 

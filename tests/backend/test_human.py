@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from primdiffusion.body.measures import measure
-from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.body.model import BodyPose, default_body, measure
 from primdiffusion.human import Human, framing, generate, place, pose_body, render
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from figure_metrics import compare_detail, detail_energy, figure_psnr
-from primdiffusion.evaluation.image_metrics import overlap
+from primdiffusion.evaluation.metrics import overlap
 from primdiffusion.primitives.primitives import K
 from scipy import ndimage
 

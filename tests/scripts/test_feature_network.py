@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from primdiffusion.evaluation.distances import frechet_distance
+from primdiffusion.evaluation.metrics import frechet_distance
 from primdiffusion.evaluation.pose_depth_network import BANDS, detail_energies
 from torch.nn import functional
 

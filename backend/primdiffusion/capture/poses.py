@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.formats.poses.built_in import built_in_vectors
+from primdiffusion.formats.poses.motion import built_in_vectors
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
 MOST_CANDIDATES = 2000

@@ -19,7 +19,6 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import reconstruction
-from primdiffusion.evaluation.image_metrics import load_lpips
 from primdiffusion.evaluation.images import (
     HEAD,
     SIDE,
@@ -29,6 +28,7 @@ from primdiffusion.evaluation.images import (
     human_images,
     mesh_images_of_seeds,
 )
+from primdiffusion.evaluation.metrics import load_lpips
 from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_depth_network
 from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from primdiffusion.body.measures import LARGEST_BETA
+from primdiffusion.body.model import LARGEST_BETA
 from primdiffusion.diffusion.codec import VALUES, CellCodec, Codec, LinearCodec
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser

@@ -17,8 +17,8 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.conditioning import body_betas, conditioning_views, spread_cameras
 from primdiffusion.capture.reader import Captures, Views
-from primdiffusion.evaluation.image_metrics import Lpips, bounding_box, overlap, psnr, ssim
 from primdiffusion.evaluation.images import TestImage, image_over, markdown_table
+from primdiffusion.evaluation.metrics import Lpips, bounding_box, overlap, psnr, ssim
 from primdiffusion.formats.requests import Count
 from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.primitives.primitives import Payload, Primitives

@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.images import SIDE, TestImage, markdown_table
+from primdiffusion.evaluation.metrics import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
     cell_means,

@@ -13,8 +13,7 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from primdiffusion.body.measures import LARGEST_BETA, measure
-from primdiffusion.body.model import default_body
+from primdiffusion.body.model import LARGEST_BETA, default_body, measure
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.arrays import LARGEST_NUMBER, array_shape, read_arrays

@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.body.measures import LARGEST_BETA
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import LARGEST_BETA, BodyPose
 from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION, RELEASED, anchor_tensors
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.unet import UNetConfig

@@ -19,9 +19,9 @@ from primdiffusion.runtime.device import device_info
 from primdiffusion.training import loop
 from primdiffusion.training.cells import CellTask, load_base, prepare
 from primdiffusion.training.config import TrainingConfig
+from primdiffusion.training.diffusion_task import SlabTask
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.run_folder import begin, open_run, versions
-from primdiffusion.training.slabs import SlabTask
 from primdiffusion.training.state import TrainingState
 from primdiffusion.version import __version__
 

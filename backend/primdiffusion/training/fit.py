@@ -20,7 +20,7 @@ from primdiffusion.encoder.blocks import UntiedConv
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.evaluation.image_metrics import psnr
+from primdiffusion.evaluation.metrics import psnr
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.picture_files import write_png
 from primdiffusion.geometry.image import encode_srgb, to_bytes

@@ -3,7 +3,7 @@
     states = train(task, config, accelerator)       # resumes from the states in the run's folder
 
 A task gives networks, the loss of each, held-out errors and pictures: `fit.EncoderTask`, `cells.CellTask`,
-`slabs.SlabTask`.
+`diffusion_task.SlabTask`.
 """
 
 from __future__ import annotations

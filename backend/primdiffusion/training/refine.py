@@ -19,7 +19,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.reader import Views
-from primdiffusion.evaluation.image_metrics import psnr
+from primdiffusion.evaluation.metrics import psnr
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, body_of, pose_body

@@ -22,13 +22,13 @@ from primdiffusion.human import generate
 from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
-from primdiffusion.training import slabs
+from primdiffusion.training import diffusion_task
 from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
+from primdiffusion.training.diffusion_task import SlabTask
 from primdiffusion.training.loop import Interrupt, Step, step_seed
 from primdiffusion.training.losses import LEVELS
-from primdiffusion.training.slabs import SlabTask
 from support.errors import refused
 from support.runs import child_environment, rows, same_tensors, sentence, timeless
 
@@ -279,7 +279,7 @@ def test_an_untrained_paper_network_has_the_loss_of_guessing_nothing(few):
 
 @pytest.mark.parametrize(("fast", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypatch, fast, dtype):
-    monkeypatch.setattr(slabs, "has_fast_bfloat16", lambda device: fast)
+    monkeypatch.setattr(diffusion_task, "has_fast_bfloat16", lambda device: fast)
     config = settings(few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, bfloat16=True))
     task = SlabTask(config, PersonFolder(few), [0], [1], torch.device("cpu"))
     seen, layer = [], torch.nn.Conv2d(56, 56, 1)  # processors are slow at convolutions in bfloat16

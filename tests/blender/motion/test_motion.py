@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from blender_primdiffusion.formats.poses.built_in import built_in_vectors
-from blender_primdiffusion.formats.poses.motion import Motion
+from blender_primdiffusion.formats.poses.motion import Motion, built_in_vectors
 from blender_primdiffusion.formats.poses.rotation import (
     about_axis,
     between,

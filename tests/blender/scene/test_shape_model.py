@@ -9,9 +9,9 @@ from support.errors import refused
 pytest.importorskip("torch", reason="the backend has another Python than this Blender")
 
 import torch
-from primdiffusion.body.measures import betas_of_measures as backend_betas_of_measures
-from primdiffusion.body.measures import measure as backend_measure
+from primdiffusion.body.model import betas_of_measures as backend_betas_of_measures
 from primdiffusion.body.model import default_body
+from primdiffusion.body.model import measure as backend_measure
 from primdiffusion.editing.reshaping import box_growth
 from primdiffusion.primitives.anchors import attach, default_anchors
 

@@ -1,4 +1,4 @@
-"""Motion: rotations of the 24 joints in each frame, for any body; and how much of it a file may hold."""
+"""Motion: rotations of the 24 joints in each frame, for any body; how much of it a file may hold; built-in poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...files.json_files import read_json
 from ...files.regular_files import FileError
+from ..joints import JOINT_NAMES
 from .rotation import to_axis_angle
 from .skeleton import joint_positions
 
@@ -127,3 +129,12 @@ def check_motion_size(path: str | Path, numbers: int) -> None:
     if numbers > most:
         reason = f"holds {numbers} numbers of poses, more than the {most} that a file of its size may have"
         raise FileError(path, reason, "cut the motion into pieces")
+
+
+BUILT_IN_FILE = Path(__file__).with_name("built_in.json")
+"""72 axis-angle values by name; written by scripts/bake_poses."""
+
+
+def built_in_vectors() -> dict[str, NDArray[np.float64]]:
+    """Axis-angle vectors [24, 3] by name, radians, y up, relative to the parents; the first is near T."""
+    return {name: np.reshape(values, (len(JOINT_NAMES), 3)) for name, values in read_json(BUILT_IN_FILE).items()}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets
+from primdiffusion.evaluation.metrics import frechet_distance, kernel_distance_of_subsets
 from primdiffusion.evaluation.pretrained_networks import CLIP_NAMES, ClipVision, Inception, load_inception
 
 

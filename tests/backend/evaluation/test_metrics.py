@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from primdiffusion.evaluation.image_metrics import (
+from primdiffusion.evaluation.metrics import (
     LARGEST_PSNR,
     Lpips,
     bounding_box,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
+from primdiffusion.evaluation.metrics import frechet_distance, kernel_distance
 from support.errors import refused
 from torchmetrics.image.kid import poly_mmd
 

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from primdiffusion.body.measures import betas_of_measures, measure
+from primdiffusion.body.model import betas_of_measures, measure
 from primdiffusion.body.model import default_body as load_default_body
 from support.errors import refused
 
