@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 import torch
 from conversation import Conversation
+from primdiffusion.commands.render import map_frame
 from primdiffusion.human import Human, framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from tiny_model import tiny_model
+
+from blender_primdiffusion.engine.drawing_child import SharedFrames
 
 CANCELLED, DOMAIN_ERROR = -32001, -32002
 STILL = torch.eye(3, 4).tolist()
@@ -127,3 +130,38 @@ def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, reques
         assert message in answer["error"]["message"]
         assert "\n" not in answer["error"]["message"]
     assert "result" in ask(child, params)[0]
+
+
+@pytest.fixture
+def frames():
+    frames = SharedFrames()
+    yield frames
+    frames.close()
+
+
+def test_a_frame_of_another_size_replaces_the_file_at_the_latest_with_the_folder(frames):
+    old = frames.take(8, 4)
+    old.combined[:] = 0
+    path, shown, folder = old.path, old.combined, frames.folder
+    assert frames.take(4, 4).path != path
+    assert not shown.any()  # still mapped
+    del old, shown
+    frames.close()
+    assert not folder.exists()
+
+
+def test_the_file_of_a_frame_that_nobody_maps_goes_when_another_is_taken(frames):
+    path = frames.take(8, 4).path
+    frames.take(4, 4)
+    assert not path.exists()
+
+
+def test_what_the_child_writes_is_what_blender_sees_and_the_folder_goes_with_its_users(frames):
+    frame = frames.take(8, 4)
+    picture = map_frame(frame.path, 8, 4)
+    picture.rgb[:] = picture.alpha[:] = 0.5
+    assert (frame.combined == 0.5).all()
+    folder = frame.path.parent
+    del frame, picture
+    frames.close()
+    assert not folder.exists()
