@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.drawing.draw import Scene, ViewSettings, draw
+from primdiffusion.drawing import Scene, ViewSettings, draw
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import default_anchors

@@ -44,7 +44,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
-from primdiffusion.drawing.draw import Scene, ViewSettings, draw
+from primdiffusion.drawing import Scene, ViewSettings, draw
 from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.metrics import Lpips, load_lpips

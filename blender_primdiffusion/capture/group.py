@@ -12,9 +12,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.camera_rig import View, bounding_sphere
+from ..formats.camera_rig import View, bounding_sphere, extent, first_frames, stand_together
 from ..formats.capture_layout import view_seed
-from ..formats.group_places import extent, first_frames, stand_together
 from ..formats.poses.motion import Motion
 from .body import Body
 from .scan import Scan

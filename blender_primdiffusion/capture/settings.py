@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ..files.picture_files import DEPTH_UNIT
-from ..formats.camera_rig import Rig, View
+from ..formats.camera_rig import MOST_TOGETHER, Rig, View
 from ..formats.capture_layout import ENDINGS
-from ..formats.group_places import MOST
 from ..formats.joints import JOINT_NAMES
 from ..formats.requests import FLOAT_DEPTH, PASSES, Count, Seed
 from ..formats.schema import Range, Slider, check
@@ -59,7 +58,7 @@ class CaptureSettings:
     """Threads of Cycles on the CPU; 0 for all cores."""
     shard: tuple[int, int] = (0, 1)
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
-    together: Annotated[int, Range(1, MOST)] = 1
+    together: Annotated[int, Range(1, MOST_TOGETHER)] = 1
     """Number of people who stand together on a floor, in front of the same cameras; each is rendered alone."""
     released_reference: bool = False
     """Also store the first subject under the name that the released code expects."""

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.drawing.draw import Scene, ViewSettings
-from primdiffusion.drawing.draw import draw as compose_scene
+from primdiffusion.drawing import Scene, ViewSettings
+from primdiffusion.drawing import draw as compose_scene
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart

@@ -32,8 +32,7 @@ from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.files.whole_files import replacing
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.group_places import MOST
+from primdiffusion.formats.camera_rig import MOST_TOGETHER, View
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.raster.textures import LINEAR_OF_BYTE
 
@@ -291,7 +290,9 @@ def groups(captures: Captures) -> list[tuple[Subject, ...]]:
         ]
         found.setdefault((subject.frames, *cameras), []).append(subject)
     return [
-        tuple(members[first : first + MOST]) for members in found.values() for first in range(0, len(members), MOST)
+        tuple(members[first : first + MOST_TOGETHER])
+        for members in found.values()
+        for first in range(0, len(members), MOST_TOGETHER)
     ]
 
 

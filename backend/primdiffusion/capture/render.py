@@ -24,8 +24,7 @@ from primdiffusion.files import picture_files
 from primdiffusion.files.regular_files import check_unlinked
 from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
-from primdiffusion.formats.group_places import extent, first_frames, stand_together
+from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere, extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.geometry.image import Image

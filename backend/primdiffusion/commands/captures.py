@@ -22,8 +22,7 @@ from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
 from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.camera_rig import Arrangement, Rig
-from primdiffusion.formats.group_places import MOST
+from primdiffusion.formats.camera_rig import MOST_TOGETHER, Arrangement, Rig
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.schema import Range, check
 from primdiffusion.training.captured_people import read_cards
@@ -65,7 +64,7 @@ class RenderCaptures:
     """Seed of the choice of poses."""
     workers: int = 1
     """Number of processes; each uses a core and about 1 GB."""
-    together: Annotated[int, Range(1, MOST)] = 1
+    together: Annotated[int, Range(1, MOST_TOGETHER)] = 1
     """Number of humans, 1 to 8, that stand together on a floor, in front of the same cameras; `coco` makes one image of
     them."""
     shard: str = "0/1"

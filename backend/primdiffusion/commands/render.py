@@ -16,8 +16,8 @@ from primdiffusion.body.model import BodyModel, default_body, pose_from_numbers,
 from primdiffusion.commands.output import decoded, march_encoded
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
-from primdiffusion.drawing.draw import draw as draw_scene
+from primdiffusion.drawing import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
+from primdiffusion.drawing import draw as draw_scene
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.files.arrays import read_numbers
 from primdiffusion.files.regular_files import as_file_error

@@ -16,8 +16,7 @@ from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_together, srgb_bytes
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.formats.group_places import GAP, places
+from primdiffusion.formats.camera_rig import GAP, Rig, places
 from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.raster.textures import LINEAR_OF_BYTE
 from support.errors import refused

@@ -10,7 +10,7 @@ import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands import render as frame_drawer
 from primdiffusion.commands.render import FrameDrawer, map_frame
-from primdiffusion.drawing.draw import Scene, ViewSettings, draw
+from primdiffusion.drawing import Scene, ViewSettings, draw
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body

@@ -13,9 +13,10 @@ import psutil
 import pytest
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.people import folder as folder_module
-from primdiffusion.people import load_base_mesh, make_person
+from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.fitting import cover
 from primdiffusion.people.folder import PeopleSet, is_there, make_people
+from primdiffusion.people.person import make_person
 from primdiffusion.people.wardrobe import SKIRTS
 from support.errors import refused
 from support.runs import within

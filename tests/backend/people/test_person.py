@@ -10,13 +10,14 @@ import trimesh
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.people import assets as assets_module
-from primdiffusion.people import load_base_mesh, make_person, open_assets, recolour
 from primdiffusion.people import payloads as payloads_module
 from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
-from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, parse_mhclo
+from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, open_assets, parse_mhclo
+from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.fitting import shown_faces, skirt_faces, under_hat, under_hem
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
+from primdiffusion.people.person import make_person, recolour
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.primitives.primitives import Payload, Primitives

@@ -16,7 +16,7 @@ from primdiffusion.commands.render import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
-from primdiffusion.drawing.draw import Scene, ViewSettings, draw
+from primdiffusion.drawing import Scene, ViewSettings, draw
 from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson

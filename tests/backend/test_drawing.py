@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
-from primdiffusion.drawing.draw import (
+from primdiffusion.drawing import (
     FIRST_PIXELS,
     GROWTH,
     NOTHING,
