@@ -225,7 +225,7 @@ def refined_figures(model: EncoderModel, captures: Captures, count: int) -> Figu
         payload = refine(reconstruct(model, person), views).human.payload
         scores += evaluate(Known(model, payload), captures, EvaluationSettings((name,), given_views=VIEWS, size=SIZE))
     means = summary(scores)["all"]
-    figures = {f"{name}_refined": getattr(means, name) for name in ("psnr", "ssim", "mask_iou")}
+    figures = {f"{name}_refined": means[name] for name in ("psnr", "ssim", "mask_iou")}
     return {**figures, "people_refined": count}
 
 
@@ -288,7 +288,7 @@ def quality_figures(qualities: dict[str, Quality]) -> Figures:
 
 
 def _mean(means: dict[str, Means] | None, part: str, figure: str) -> float | int | None:
-    return None if means is None else getattr(means[part], figure)
+    return None if means is None else means[part][figure]
 
 
 def table_of(qualities: dict[str, Quality]) -> str:

@@ -140,14 +140,14 @@ def figures_of(name: str, path: Path, means: Means) -> Figures:
     """Figures of one form, beside the paper's PSNR (training people, all views and poses)."""
     card = load_encoder(path).card
     return {
-        f"psnr_{name}": means.psnr and round(means.psnr, 3),
-        f"ssim_{name}": means.ssim and round(means.ssim, 5),
-        f"psnr_box_{name}": means.psnr_box and round(means.psnr_box, 3),
-        f"mask_iou_{name}": means.mask_iou and round(means.mask_iou, 4),
+        f"psnr_{name}": means["psnr"] and round(means["psnr"], 3),
+        f"ssim_{name}": means["ssim"] and round(means["ssim"], 5),
+        f"psnr_box_{name}": means["psnr_box"] and round(means["psnr_box"], 3),
+        f"mask_iou_{name}": means["mask_iou"] and round(means["mask_iou"], 4),
         f"paper_psnr_{name}": PAPER_PSNR[name],
         f"steps_{name}": card["steps"],
         f"minutes_{name}": round(card["seconds"] / 60, 2),
-        f"pictures_{name}": means.pictures,
+        f"pictures_{name}": means["pictures"],
     }
 
 

@@ -111,7 +111,7 @@ class EvaluateReconstruction:
                 "version": __version__,
                 "checkpoint": dict(model.card),
                 "settings": dataclasses.asdict(settings),
-                "means": {name: dataclasses.asdict(part) for name, part in means.items()},
+                "means": means,
                 "pictures": [dataclasses.asdict(score) for score in scores],
             }
             _write(self.json, record)

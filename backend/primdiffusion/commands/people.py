@@ -17,8 +17,8 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
+from primdiffusion.runtime.worker_process import lock_folder
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
-from primdiffusion.training.run_folder import lock_folder
 
 
 def people(command: PeopleCommand, session: Session, report: ReportProgress) -> Path:

@@ -8,38 +8,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.conditioning import body_betas, conditioning_views, spread_cameras
-from primdiffusion.capture.reader import Captures, Views
+from primdiffusion.capture.reader import Captures
+from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.evaluation.images import TestImage, image_over, markdown_table
 from primdiffusion.evaluation.metrics import Lpips, bounding_box, overlap, psnr, ssim
 from primdiffusion.formats.requests import Count
 from primdiffusion.formats.schema import Checked, Range
-from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
-
-
-class Reconstructor(Protocol):
-    """The interface of an evaluated encoder, such as `primdiffusion.encoder.model.EncoderModel`."""
-
-    @property
-    def body(self) -> BodyModel:
-        """The body to which captures must be fitted."""
-        ...
-
-    def encode(self, views: Views, betas: Float[Tensor, "n"]) -> Payload:
-        """Encode the subject in the views (unbatched, of one pose)."""
-        ...
-
-    def place(self, payload: Payload, betas: Float[Tensor, "n"], pose: BodyPose) -> Primitives:
-        """Place the payload on the subject's body in a pose."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +56,7 @@ class ImageMetrics:
     lpips: float | None = None
 
 
+Means = dict[str, float | None]
 FIGURES = tuple(field.name for field in dataclasses.fields(ImageMetrics))
 
 
@@ -103,27 +84,14 @@ SPLITS = {
 """Subsets that are averaged, and their titles; the paper reports `all`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Means:
-    """Means over a subset; None for metrics that no image has."""
-
-    pictures: int
-    psnr: float | None
-    """Mean of the images' decibels."""
-    ssim: float | None
-    psnr_box: float | None
-    ssim_box: float | None
-    mask_iou: float | None
-    lpips: float | None
-
-
 @torch.no_grad()
 def evaluate(
-    model: Reconstructor, captures: Captures, settings: EvaluationSettings | None = None, lpips: Lpips | None = None
+    model: EncoderModel, captures: Captures, settings: EvaluationSettings | None = None, lpips: Lpips | None = None
 ) -> Iterator[PictureScore]:
     """Yield the metrics of every image that the settings select; deterministic.
 
-    Images are rendered on the device of the payloads; one of 512 x 512 takes about a sixth of a second on CPU.
+    Of `model`, `body`, `encode` and `place` are used. Images are rendered on the device of the payloads; one of
+    512 x 512 takes about a sixth of a second on CPU.
 
     Raises:
         KeyError: unknown subject.
@@ -174,7 +142,7 @@ def image_metrics(image: TestImage, target: TestImage, lpips: Lpips | None = Non
 
 
 def summary(scores: Iterable[PictureScore]) -> dict[str, Means]:
-    """Average over each of the `SPLITS`."""
+    """Number of pictures and means of the metrics in each of the `SPLITS`; None for metrics that no image has."""
     parts: dict[str, list[ImageMetrics]] = {name: [] for name in SPLITS}
     for score in scores:
         views = "given_views" if score.given_view else "novel_views"
@@ -184,18 +152,18 @@ def summary(scores: Iterable[PictureScore]) -> dict[str, Means]:
 
 
 def _means(metrics: list[ImageMetrics]) -> Means:
-    figures = {}
+    figures: Means = {"pictures": len(metrics)}
     for name in FIGURES:
         values = [value for value in (getattr(one, name) for one in metrics) if value is not None]
         figures[name] = sum(values) / len(values) if values else None
-    return Means(len(metrics), **figures)
+    return figures
 
 
 def table(means: Mapping[str, Means]) -> str:
     """Format the summary as a Markdown table, a row a subset."""
     texts = []
     for name, part in means.items():
-        figures = [(getattr(part, figure), ".2f" if figure.startswith("psnr") else ".4f") for figure in FIGURES]
-        texts.append([SPLITS[name], str(part.pictures), *("-" if v is None else format(v, f) for v, f in figures)])
+        figures = [(part[figure], ".2f" if figure.startswith("psnr") else ".4f") for figure in FIGURES]
+        texts.append([SPLITS[name], str(part["pictures"]), *("-" if v is None else format(v, f) for v, f in figures)])
     headings = ("pictures of", "number", "PSNR", "SSIM", "PSNR in box", "SSIM in box", "mask IoU", "LPIPS")
     return markdown_table(headings, texts)

@@ -1,4 +1,4 @@
-"""Worker processes: one thread each, ending with their parent.
+"""Worker processes, one thread each, ending with their parent; and a folder that one process holds.
 
 A function may run in a process of its own: igl and xatlas hold the GIL for seconds, in which calls could not be
 cancelled and the child would look dead to its parent.
@@ -15,7 +15,12 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, TypeVar
+
+from filelock import FileLock, Timeout
+
+from primdiffusion.files.regular_files import check_unlinked
 
 POLL_S = 0.2
 Result = TypeVar("Result")
@@ -130,3 +135,28 @@ def _single_threaded_children() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+LOCK = ".lock"
+"""The lock file in the folder. It stays there: removing it while another process opens it would let two in."""
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Hold a folder, created if need be, for one process at a time. Raises ValueError, OSError.
+
+    The system releases the lock when the process ends, however it ends.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    check_unlinked(folder / LOCK)
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"another process works in {folder}: wait for it, or give another folder") from None
+    except NotImplementedError as e:
+        raise ValueError(f"the disk of {folder} has no locks: give a folder on another disk") from e
+    try:
+        yield
+    finally:
+        lock.release()

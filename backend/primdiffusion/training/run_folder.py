@@ -23,40 +23,15 @@ from typing import Any
 import accelerate
 import torch
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
-from filelock import FileLock, Timeout
 
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
 from primdiffusion.files.whole_files import remove_abandoned, write_atomically
 from primdiffusion.runtime.failures import optional_package
+from primdiffusion.runtime.worker_process import lock_folder
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__
-
-LOCK = ".lock"
-"""The lock file in the folder. It stays there: removing it while another process opens it would let two in."""
-
-
-@contextlib.contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder, created if need be, for one process at a time. Raises ValueError, OSError.
-
-    The system releases the lock when the process ends, however it ends.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    check_unlinked(folder / LOCK)
-    lock = FileLock(folder / LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise ValueError(f"another process works in {folder}: wait for it, or give another folder") from None
-    except NotImplementedError as e:
-        raise ValueError(f"the disk of {folder} has no locks: give a folder on another disk") from e
-    try:
-        yield
-    finally:
-        lock.release()
-
 
 log = logging.getLogger(__name__)
 

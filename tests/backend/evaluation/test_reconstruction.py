@@ -187,7 +187,7 @@ def test_summary_averages_each_part_alone():
     scores = [score(30, True, True, 20), score(20, False, True), score(16, False, False, 10), score(18, False, False)]
     means = summary(scores)
     assert list(means) == list(SPLITS)
-    assert [(part.pictures, part.psnr, part.psnr_box) for part in means.values()] == [
+    assert [(part["pictures"], part["psnr"], part["psnr_box"]) for part in means.values()] == [
         (4, 21, 15), (1, 30, 20), (1, 20, None), (0, None, None), (2, 17, 10)
     ]  # fmt: skip
     rows = table(means).splitlines()
