@@ -68,7 +68,7 @@ from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.reconstruction.from_captures import PersonComponents, reconstruct, targets_of
+from primdiffusion.reconstruction.from_captures import PriorFit, reconstruct, targets_of
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from record import command_line, report, run, surroundings
@@ -267,7 +267,7 @@ def case_of(captures: Captures, name: str, frame: int) -> Case:
 
 def by_mirror(model: DiffusionModel, person: CapturedPerson) -> Human:
     """Fit the mean human's voxels to the front view, and to its mirror image seen from the opposite side."""
-    views, components = person.views, PersonComponents.of(model)
+    views, components = person.views, PriorFit.of(model)
     frames = default_frames(person.betas, views.pose)
     turned = views.camera.world_to_camera @ half_turn_about(frames.position.mean(0))
     intrinsics = views.camera.intrinsics.clone()

@@ -53,7 +53,7 @@ class Seen(NamedTuple):
     """Learned features, of unit variance over the training pictures."""
 
 
-class Stage(nn.Module):
+class ResidualStage(nn.Module):
     """A convolution that halves width and height, then one that keeps them, with batch normalisation."""
 
     def __init__(self, channels: int, out: int, convolutions: int) -> None:
@@ -77,7 +77,8 @@ class PoseDepthNetwork(nn.Module):
         self.vocabulary = vocabulary
         self.card: dict[str, Any] = {}
         self.down = nn.ModuleList(
-            Stage(before, out, count) for before, out, count in zip((3, *WIDTHS), WIDTHS, (1, 1, 2, 2, 2), strict=False)
+            ResidualStage(before, out, count)
+            for before, out, count in zip((3, *WIDTHS), WIDTHS, (1, 1, 2, 2, 2), strict=False)
         )
         lower = WIDTHS[:0:-1]
         self.lateral = nn.ModuleList(nn.Conv2d(before, out, 1) for before, out in itertools.pairwise(lower))

@@ -65,7 +65,7 @@ TRIAL_VIEWS = 2
 STEPS = 2
 """Gauss-Newton steps from there, in all views."""
 FIT_STEPS = STEPS + 1
-"""How often `PersonComponents.fit` reports."""
+"""How often `PriorFit.fit` reports."""
 OBSERVATIONS = 150.0
 """Number of independent pixels that a view counts as. What person components cannot draw differs over patches, not over
 pixels; more would fit them to noise, fewer would ignore the view."""
@@ -98,7 +98,7 @@ def reconstruct(
         >>> found.provenance["reconstructed_from"]
         ['anna.png']
 
-    Raises ValueError if the encoder's output is not finite, or as `PersonComponents.of`.
+    Raises ValueError if the encoder's output is not finite, or as `PriorFit.of`.
     """
     origin: dict[str, Any] = {"reconstructed_from": person.subject}
     if person.frame is not None:
@@ -108,7 +108,7 @@ def reconstruct(
         origin |= {"checkpoint": model.card.get("name", "unnamed"), "full_density": model.config.full_density}
         betas = betas_of_frames(model.config, person.betas)
         return Human(payload, betas, {**origin, "version": __version__}, model.body_setup).to("cpu").validate()
-    components, views, generator = PersonComponents.of(model), person.views, None
+    components, views, generator = PriorFit.of(model), person.views, None
     if views.pose.translation.ndim > 1:
         frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
     else:
@@ -121,7 +121,7 @@ def reconstruct(
 
 def steps_of(model: EncoderModel | DiffusionModel) -> int:
     """How often `reconstruct` reports."""
-    return 0 if isinstance(model, EncoderModel) else PersonComponents.of(model).start_steps + FIT_STEPS
+    return 0 if isinstance(model, EncoderModel) else PriorFit.of(model).start_steps + FIT_STEPS
 
 
 def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"]) -> Payload:
@@ -160,8 +160,8 @@ class Explanation(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class PersonComponents:
-    """The person components of a diffusion model, and their prior."""
+class PriorFit:
+    """Fits humans to pictures, by the person components of a diffusion model and their prior."""
 
     denoiser: PersonDenoiser
     chain: list[int]
@@ -172,7 +172,7 @@ class PersonComponents:
     _latest: list = dataclasses.field(default_factory=lambda: [None, None], repr=False)
 
     @classmethod
-    def of(cls, model: DiffusionModel) -> PersonComponents:
+    def of(cls, model: DiffusionModel) -> PriorFit:
         """Those of a model; ValueError if it has none, or is of another body than the default one."""
         if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
             raise ValueError("the model has no person components: give a checkpoint of the default architecture")

@@ -22,7 +22,7 @@ from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
+from primdiffusion.reconstruction.from_captures import PriorFit, targets_of
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
@@ -102,7 +102,7 @@ def person_in_pictures(
         >>> person.betas.shape
         torch.Size([10])
 
-    Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
+    Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PriorFit.of`.
     """
     pose, cameras = (None if path is None else Path(path) for path in (pose, cameras))
     photographs = read_photographs(
@@ -164,7 +164,7 @@ def start_of(
 
 def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
     """The standing body whose arms fit the outline best."""
-    components, betas = PersonComponents.of(model), model.shapes.bias.clone()
+    components, betas = PriorFit.of(model), model.shapes.bias.clone()
     payload = components.payload(components.coefficients(components.everyone()))
     lenses = [photograph.lens() for photograph in photographs] if views is None else views
     found = []
@@ -180,9 +180,9 @@ def fit_posture_in(
 ) -> Found:
     """The posture in the pictures; deterministic. Things that no body explains are left out of the last round.
 
-    `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
+    `on_step` is called POSTURE_STEPS times. Raises ValueError as `PriorFit.of`.
     """
-    components = PersonComponents.of(model)
+    components = PriorFit.of(model)
     fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
     for number, (side, stage, coefficient_steps) in enumerate(ROUNDS):
         payload = components.payload(components.coefficients(people))
@@ -204,11 +204,11 @@ def fit_posture_in(
 
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
-    """How well what was found explains the pictures. Raises ValueError as `PersonComponents.of`."""
+    """How well what was found explains the pictures. Raises ValueError as `PriorFit.of`."""
     pairs = zip(found.photographs, photographs, strict=True)
     left_out = max(1 - _area(kept) / _area(one) if kept.uncut is None else 0.0 for kept, one in pairs)
     targets = _targets(found.photographs, found.posture, ROUNDS[0].side)
-    return quality_of(PersonComponents.of(model), found.posture, targets, left_out)
+    return quality_of(PriorFit.of(model), found.posture, targets, left_out)
 
 
 def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Sequence[PosedView]) -> list[Photograph]:
@@ -218,7 +218,7 @@ def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Seque
 
 
 def _mean_human(model: DiffusionModel) -> Payload:
-    components = PersonComponents.of(model)
+    components = PriorFit.of(model)
     return components.payload(components.coefficients(components.everyone()))
 
 

@@ -23,7 +23,7 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.reconstruction.from_captures import PersonComponents
+from primdiffusion.reconstruction.from_captures import PriorFit
 from primdiffusion.reconstruction.posture_fit import COARSE, Posture, each
 from primdiffusion.reconstruction.posture_masks import grown, unexplained
 from primdiffusion.render.image import PosedView
@@ -123,7 +123,7 @@ class FitQuality(NamedTuple):
 
 
 def quality_of(
-    components: PersonComponents, posture: Posture, targets: Sequence[PosedView], left_out: float = 0.0
+    components: PriorFit, posture: Posture, targets: Sequence[PosedView], left_out: float = 0.0
 ) -> FitQuality:
     """How well a posture explains its pictures: of several, the one that it explains worst.
 

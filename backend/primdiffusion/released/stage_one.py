@@ -44,7 +44,7 @@ NOT_USED = {
 IMPORTED = "as the encoder 'released'"
 
 
-class Convolution(NamedTuple):
+class ConvolutionNames(NamedTuple):
     """Names of the three tensors of a weight-normalised convolution."""
 
     weight: str
@@ -210,7 +210,7 @@ def _grouped(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, dict[str, 
     return groups
 
 
-def _matched(group: str, found: Mapping[str, Tensor]) -> dict[str, Convolution]:
+def _matched(group: str, found: Mapping[str, Tensor]) -> dict[str, ConvolutionNames]:
     """The convolution in the file of each layer of a group, by the layer's module in `Encoder`."""
     modules: dict[str, dict[str, Tensor]] = collections.defaultdict(dict)
     for key, value in found.items():
@@ -246,7 +246,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _convolution(module: str, found: Mapping[str, Tensor]) -> Convolution:
+def _convolution(module: str, found: Mapping[str, Tensor]) -> ConvolutionNames:
     """Tell the three tensors of a convolution apart."""
     weights = [key for key, value in found.items() if value.ndim == 4 and value.numel() > max(value.shape)]
     biases = [key for key, value in found.items() if value.ndim == 3]
@@ -262,7 +262,7 @@ def _convolution(module: str, found: Mapping[str, Tensor]) -> Convolution:
             f"{gains[0]!r} has shape {tuple(found[gains[0]].shape)}, not one value per channel of {biases[0]!r} "
             f"{tuple(found[biases[0]].shape)}"
         )
-    return Convolution(weights[0], gains[0], biases[0])
+    return ConvolutionNames(weights[0], gains[0], biases[0])
 
 
 def _check_attention(found: Mapping[str, Tensor], prefix: str) -> None:

@@ -20,7 +20,7 @@ from primdiffusion.reconstruction.from_captures import (
     FIT_STEPS,
     OBSERVATIONS,
     PIXEL_STD,
-    PersonComponents,
+    PriorFit,
     encode_and_fit,
     reconstruct,
     steps_of,
@@ -121,7 +121,7 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
         variance=torch.full((2, 3), 12.0**2),
         kind=PRIOR.kind.transpose(0, 1),
     )
-    components = dataclasses.replace(PersonComponents.of(MODEL), prior=prior)
+    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior)
     wanted = torch.tensor([-140.0, -155.0, -150.0])
     human = Human(components.payload(wanted), BETAS, {})
     person = captured(human, BodyPose.rest(), [0.0])
@@ -135,7 +135,7 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
 
 def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice():
     prior = dataclasses.replace(PRIOR, centre=torch.zeros(1, 2, 3), variance=torch.full((1, 3), 1e-8))
-    components = dataclasses.replace(PersonComponents.of(MODEL), prior=prior)
+    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior)
     human = human_of(COLOURS)
     targets = targets_of(captured(human, BodyPose.rest(), [0.0]).views, [frames_of(human)], 64)
     everyone = components.everyone()
@@ -150,7 +150,7 @@ def test_a_seed_draws_the_rest_too():
     behind = frames_of(human_of(COLOURS)).rotation[:, 2, 2] < -0.7
     one, other = (reconstruct(MODEL, person, seed=seed).payload.density[behind] for seed in (1, 2))
     assert (one - other).abs().mean() > 0.1  # coefficients are of colours alone
-    components = PersonComponents.of(MODEL)
+    components = PriorFit.of(MODEL)
     rest = components.drawn_rest(COLOURS, torch.Generator().manual_seed(0))
     assert torch.allclose(PRIOR.outside(rest[None])[0], rest, atol=1e-5)
     *_, last = sample(MODEL, [0])
@@ -161,7 +161,7 @@ def test_what_components_cannot_draw_comes_from_the_network():
     model = tiny_model(SLOW)
     with torch.no_grad():
         model.denoiser.local.outer.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 2.0]))
-    rest = PersonComponents.of(model).expected_rest(COLOURS)
+    rest = PriorFit.of(model).expected_rest(COLOURS)
     assert torch.allclose(rest[3], torch.tensor(2 * 0.01**0.5), atol=0.01)  # in standard deviations of the rest
     assert rest[:3].abs().max() < 0.01
 

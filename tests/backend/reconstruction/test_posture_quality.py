@@ -14,7 +14,7 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import framing
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.reconstruction.from_captures import PersonComponents
+from primdiffusion.reconstruction.from_captures import PriorFit
 from primdiffusion.reconstruction.from_pictures import Found, fit_quality
 from primdiffusion.reconstruction.posture_fit import Posture
 from primdiffusion.reconstruction.posture_masks import without_things
@@ -25,7 +25,7 @@ from primdiffusion.render.march import march
 from tiny_model import tiny_model
 
 MODEL, SIDE = tiny_model(), 96
-COMPONENTS = PersonComponents.of(MODEL)
+COMPONENTS = PriorFit.of(MODEL)
 PAYLOAD = COMPONENTS.payload(COMPONENTS.coefficients(COMPONENTS.everyone()))
 NONE = FitQuality(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "left forearm")
 
