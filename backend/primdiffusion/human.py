@@ -58,7 +58,7 @@ class Human(TensorRecord):
     provenance: Mapping[str, Any]
     """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
     sample, attributes and guidance if requested, `unfollowed` (the values that it shows instead of requested ones,
-    `diffusion.reading`), checkpoint, checkpoint_sha256, full_density, version."""
+    `diffusion.model`), checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
     """Body and anchors; None is the default body."""
 
