@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from bpy_extras.view3d_utils import region_2d_to_location_3d
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
@@ -45,7 +46,7 @@ def add_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.types
 
 
 def frame_in_view() -> None:
-    """Have the first 3D view frame what is selected, unless a view looks through a camera."""
+    """Have the first 3D view frame what is selected, beside its sidebar, unless a view looks through a camera."""
     if bpy.app.background:
         return
     bpy.context.view_layer.update()
@@ -61,6 +62,13 @@ def frame_in_view() -> None:
     region = next(region for region in area.regions if region.type == "WINDOW")
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.view3d.view_selected()
+    sidebar, around = next(one for one in area.regions if one.type == "UI"), area.spaces.active.region_3d
+    covered = region.x + region.width - sidebar.x if sidebar.width > 1 and sidebar.alignment == "RIGHT" else 0
+    if covered > 0:
+        around.view_distance *= max(1.0, min(region.width, region.height) / (region.width - covered))
+        around.update()
+        beside = ((region.width + covered) / 2, region.height / 2)
+        around.view_location = region_2d_to_location_3d(region, around, beside, around.view_location)
 
 
 _STEP_PICTURE_PX = 256

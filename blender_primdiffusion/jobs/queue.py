@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import abc
 import collections
+import contextlib
 import dataclasses
 import itertools
+import os
+import platform
 import tempfile
 import time
+import tomllib
 import traceback
 from pathlib import Path
 from typing import Any
@@ -16,10 +20,9 @@ import bpy
 
 from ..backend.client import Died, Silent
 from ..backend.environment import NOT_ABSOLUTE
-from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
+from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text, sentence
 from ..files.regular_files import is_local_path, remove_folder
-from ..places import new_backend, preference
-from .error_log import defect_in_the_scene, error_in_the_scene, write_error_log
+from ..places import EXTENSION, new_backend, preference
 
 PREVIEW_PX = 16
 """Of the child's previews, which most jobs do not use."""
@@ -76,6 +79,8 @@ def chosen_checkpoint() -> str:
     return chosen
 
 
+_LOG_LINES = 40
+"""Of the child, in the file for a bug report."""
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
 
@@ -110,6 +115,16 @@ class JobOutcome:
     def succeeded(self) -> bool:
         """Neither failed nor cancelled."""
         return self.error is None and self.notice != CANCELLED
+
+
+def error_in_the_scene(error: Exception) -> RequestError:
+    """The error of a result that could not enter the scene; an exception may have an attribute `kind`."""
+    return RequestError(sentence(error), "", str(getattr(error, "kind", "scene")))
+
+
+def error_log() -> Path:
+    """The file for a bug report about the last error."""
+    return Path(bpy.app.tempdir or tempfile.gettempdir()) / "primdiffusion_error.txt"
 
 
 class Queue:
@@ -189,7 +204,8 @@ class Queue:
             error = error_in_the_scene(e)
         except Exception as e:
             traceback.print_exc()
-            error = defect_in_the_scene(e)
+            trace = tuple(traceback.format_exc().splitlines())
+            error = RequestError(f"the result could not be put into the scene: {sentence(e)}", "", "scene", trace)
         return self._end(JobOutcome(entry, notice, error))
 
     def fail(self, error: RequestError) -> JobOutcome:
@@ -273,12 +289,28 @@ class Queue:
 
     def _end(self, outcome: JobOutcome) -> JobOutcome:
         if outcome.error is not None:
-            write_error_log(outcome.entry.job.label, outcome.error, self.info, self.log)
+            self._write_error_log(outcome.entry.job.label, outcome.error)
         self.outcomes[outcome.entry.job.kind] = self.last = outcome
         self.current = self.request = None
         self.idle_since = time.monotonic()
         self._clear_folder()
         return outcome
+
+    def _write_error_log(self, job: str, error: RequestError) -> None:
+        """Write what a bug report needs into the file `error_log`. The home folder is written as "~"."""
+        with open(Path(__file__).resolve().parents[1] / "blender_manifest.toml", "rb") as manifest:
+            version = tomllib.load(manifest)["version"]
+        about = {name: self.info.get(name, "?") for name in ("version", "python", "torch", "device_name")}
+        lines = [
+            f"PrimDiffusion {version} ({'extension' if EXTENSION.startswith('bl_ext.') else 'from source'})",
+            f"Blender {bpy.app.version_string} ({bpy.app.build_hash.decode(errors='replace')})",
+            f"System {platform.platform()}, {platform.machine()}, {os.cpu_count()} processors",
+            "Backend {version}, Python {python}, torch {torch}, device {device_name}".format(**about),
+            f"{job} ({error.kind}): {error_text(error)}",
+            *(f"    {line}" for line in (error.log or self.log)[-_LOG_LINES:]),
+        ]
+        with contextlib.suppress(OSError):  # the disk may be full
+            error_log().write_text("\n".join(lines).replace(str(Path.home()), "~"), encoding="utf-8")
 
     def _clear_folder(self) -> None:
         if self._folder is not None:

@@ -9,9 +9,8 @@ from pathlib import Path
 import bpy
 
 from ..files.regular_files import printable
-from ..jobs.error_log import error_log
 from ..jobs.follow import blocking_activity
-from ..jobs.queue import JobOutcome, queue
+from ..jobs.queue import JobOutcome, error_log, queue
 from ..jobs.windows import icons
 from ..places import EXTENSION, backend_is_named, preference
 

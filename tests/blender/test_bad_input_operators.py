@@ -220,8 +220,7 @@ def outside(anna, monkeypatch):
 def _asked(monkeypatch, folder: Path) -> None:
     """Works are asked for their parameters, and then end well: what the child does is for other tests."""
     from blender_primdiffusion.jobs import follow
-    from blender_primdiffusion.jobs.error_log import error_in_the_scene
-    from blender_primdiffusion.jobs.queue import JobOutcome, queue
+    from blender_primdiffusion.jobs.queue import JobOutcome, error_in_the_scene, queue
 
     def wait_for(entry):
         queue.waiting.remove(entry)

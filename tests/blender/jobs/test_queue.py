@@ -17,7 +17,7 @@ from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LON
 from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow, watch
 from blender_primdiffusion.jobs.generate import GenerateJob
-from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.queue import error_log, queue
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
@@ -232,3 +232,19 @@ def test_progress_is_shown_once_beside_the_button_and_not_in_the_jobs_panel(addo
     ops.cancel()
     drive()
     assert shown(PRIMDIFFUSION_PT_jobs, addon) == []
+
+
+def test_the_panel_shows_the_error_its_button_and_the_log(addon):
+    with pytest.raises(RuntimeError):
+        ops.generate(seed=NO_MEMORY)
+    texts = shown(PRIMDIFFUSION_PT_generate, addon)
+    assert "wm.path_open" in texts
+
+
+def test_the_log_holds_versions_and_the_error(addon):
+    with pytest.raises(RuntimeError):
+        ops.generate(seed=FAILS)
+    text = error_log().read_text(encoding="utf-8")
+    for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
+        assert part in text
+    assert str(Path.home()) not in text
