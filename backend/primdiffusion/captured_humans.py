@@ -93,14 +93,10 @@ def _draw_band(primitives: Primitives, view: View, samples: int, rows: slice, im
     blocks = height, samples, view.width, samples
     image.rgb[rows] = drawn.rgb.numpy().reshape(*blocks, 3).mean((1, 3)).clip(0, 1)
     image.alpha[rows] = drawn.alpha.numpy().reshape(blocks).mean((1, 3))
-    image.depth[rows] = drawn.first_hit.numpy()[samples // 2 :: samples, samples // 2 :: samples] / _secants(view)[rows]
-
-
-def _secants(view: View) -> Float[np.ndarray, "H W"]:
-    """Distance along each pixel's ray per metre along the optical axis."""
-    rows, columns = np.mgrid[: view.height, : view.width] + 0.5
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(view.intrinsics).T
-    return np.linalg.norm(rays, axis=-1)
+    image.depth[rows] = (
+        drawn.first_hit.numpy()[samples // 2 :: samples, samples // 2 :: samples]
+        / as_camera(view).secants().numpy()[rows]
+    )
 
 
 def visible_voxels(primitives: Primitives) -> torch.Tensor:

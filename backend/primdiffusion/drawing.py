@@ -245,7 +245,7 @@ class People:
 
 
 def _marched(primitives: Primitives, camera: Camera, look: ViewSettings, end: ndarray | None) -> People:
-    secant = _secants(camera)
+    secant = camera.secants().cpu().numpy()
     span = _span(primitives, camera, look.clip, end, secant)
     began = time.perf_counter()
     rendering = march(primitives, camera, look.settings, span=span)
@@ -295,22 +295,6 @@ def _encode_coverage(picture: Image) -> None:
     """Replace coverage by opaque linear grey whose sRGB encoding equals the coverage."""
     picture.rgb[:] = decode_srgb(picture.rgb)
     picture.alpha[:] = 1
-
-
-def _secants(camera: Camera) -> Float32[ndarray, "h w"]:
-    """Distance along the pixel's ray per metre along the optical axis."""
-    secant = np.empty((camera.height, camera.width), np.float32)
-    _fill_secants(secant, np.linalg.inv(camera.intrinsics.detach().cpu().double().numpy()))
-    return secant
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill_secants(secant, inverse):
-    for row in range(secant.shape[0]):
-        y = inverse[1, 1] * (row + 0.5) + inverse[1, 2]
-        x = inverse[0, 1] * (row + 0.5) + inverse[0, 2]
-        for column in range(secant.shape[1]):
-            secant[row, column] = math.sqrt(1.0 + y * y + (x + inverse[0, 0] * (column + 0.5)) ** 2)
 
 
 def _span(

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from tiny_model import save_tiny_checkpoint
+from support.tiny import save_tiny_checkpoint
 
 
 class Failed(NamedTuple):

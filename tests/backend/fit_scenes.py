@@ -21,7 +21,7 @@ from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.loop import Interrupt
 from primdiffusion.training.run_folder import METRICS
 from support.runs import rows
-from tiny_encoder import TINY
+from support.tiny import TINY
 
 STATE = "state.safetensors"
 FEW = {"steps": 6, "batch": 1, "views": 2, "targets": 1, "size": 16, "step": 0.02, "hold_scale": 2, "log_every": 1}

@@ -18,7 +18,7 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.render.march import RELEASED, march
-from tiny_encoder import save_tiny_encoder
+from support.tiny import save_tiny_encoder
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 

@@ -10,7 +10,7 @@ from primdiffusion.human import Human, framing, generate, place, pose_body, rend
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
 from support.errors import refused
-from tiny_model import FULL_DENSITY, tiny_model
+from support.tiny import FULL_DENSITY, tiny_model
 
 
 @pytest.fixture(scope="module")

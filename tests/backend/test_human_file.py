@@ -18,7 +18,7 @@ from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
 from primdiffusion.render.march import march
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 
 @pytest.fixture(scope="module")

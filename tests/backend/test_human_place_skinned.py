@@ -14,7 +14,7 @@ from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import march
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 STILL = torch.eye(3, 4)
 

@@ -11,7 +11,7 @@ import primdiffusion as pd
 import pytest
 from PIL import Image
 from primdiffusion.reconstruction import from_pictures
-from tiny_model import save_tiny_checkpoint
+from support.tiny import save_tiny_checkpoint
 
 
 def test_the_names_of_a_first_script_are_there(tmp_path):

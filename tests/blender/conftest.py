@@ -102,7 +102,7 @@ def addon(saved_scene, tmp_path, monkeypatch):
 def real_child(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, with the real child and the checkpoint of a small model."""
     from backend_python import use_this_python
-    from tiny_model import save_tiny_checkpoint
+    from support.tiny import save_tiny_checkpoint
 
     import blender_primdiffusion
     from blender_primdiffusion.backend.client import BackendClient

@@ -33,7 +33,7 @@ def checkpoint(tmp_path_factory) -> str:
     """Empty, for the checkpoint in the zip; until there is one, a tiny one."""
     if WEIGHTS.is_file():
         return ""
-    from tiny_model import save_tiny_checkpoint
+    from support.tiny import save_tiny_checkpoint
 
     return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from conversation import Conversation
-from tiny_model import SLOW, save_tiny_checkpoint
+from support.tiny import SLOW, save_tiny_checkpoint
 from waiting import PYTHON
 
 from blender_primdiffusion.backend.client import BackendClient

@@ -45,7 +45,7 @@ from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.people.stored_people import read_person
 from primdiffusion.runtime.failures import describe
-from tiny_model import save_tiny_checkpoint, tiny_model
+from support.tiny import save_tiny_checkpoint, tiny_model
 
 LONGEST_SENTENCE, LONGEST_S, MOST_MEMORY = 300, 5.0, 500 * 2**20
 

@@ -9,7 +9,7 @@ from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from primdiffusion.diffusion.model import sample
 from primdiffusion.formats import requests
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from diffusers_scheduler import PrimDiffusionScheduler

@@ -10,7 +10,7 @@ from conversation import Conversation
 from primdiffusion.commands.render import map_frame
 from primdiffusion.human import Human, framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 from blender_primdiffusion.engine.drawing_child import SharedFrames
 

@@ -5,16 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_model
 import torch
-from editing_people import anybody
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
 from primdiffusion.editing.regions import parts_of, region_from_weights, region_of
 from primdiffusion.formats.requests import PARTS, SAMPLERS
 from primdiffusion.human_file import load_human, save_human
+from support import tiny
 from support.errors import refused
-from tiny_model import VOCABULARY
+from support.tiny import VOCABULARY, anybody
 
 from blender_primdiffusion.ui.generate_settings import read_vocabulary
 
@@ -123,7 +122,7 @@ def test_samplers_are_the_backends():
 
 def test_the_card_of_a_checkpoint_tells_what_its_model_knows(checkpoint):
     read = read_vocabulary(checkpoint)
-    assert (read.categories, read.scalars) == (tiny_model.VOCABULARY.categories, tiny_model.VOCABULARY.scalars)
+    assert (read.categories, read.scalars) == (tiny.VOCABULARY.categories, tiny.VOCABULARY.scalars)
 
 
 def test_the_default_checkpoint_is_read_as_the_backend_reads_it():

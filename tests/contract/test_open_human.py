@@ -19,7 +19,7 @@ from primdiffusion.human import Human, generate, place
 from primdiffusion.human_file import load_human, save_body, save_human
 from primdiffusion.primitives.anchors import default_anchors
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 from blender_primdiffusion.scene.human_file import (
     body_arrays,

@@ -12,7 +12,7 @@ from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 from scripts.feature_space import __main__ as command
 from scripts.feature_space.comparison import COLUMNS, compare, open_reference_set, real_vs_real

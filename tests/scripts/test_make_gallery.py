@@ -5,7 +5,7 @@ from pathlib import Path
 
 from primdiffusion.human_file import load_human
 from support.errors import refused
-from tiny_model import save_tiny_checkpoint
+from support.tiny import save_tiny_checkpoint
 
 SPEC = importlib.util.spec_from_file_location("make_gallery", Path(__file__).parents[2] / "scripts" / "make_gallery.py")
 assert SPEC is not None

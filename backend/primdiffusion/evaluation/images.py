@@ -114,8 +114,7 @@ def primitive_images(
         camera = body_camera(posed.vertices, 2 * math.pi * view / views)
         seen = march(primitives, camera.to(primitives.position.device), settings).to("cpu")
         image = image_over(1, subject, seen.rgb, seen.alpha, frame, view)
-        cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]  # the marcher's distances are along rays
-        yield _with_truth(image, seen.depth * cosine, posed.joints, camera)
+        yield _with_truth(image, seen.depth / camera.secants(), posed.joints, camera)  # distances are along rays
 
 
 def mesh_images(

@@ -30,6 +30,15 @@ class Camera(TensorRecord):
 
     def rays(self) -> tuple[Float[Tensor, "*#c 3"], Float[Tensor, "*#c height width 3"]]:
         """The common origin and the unit world direction of the ray through each pixel centre (SPEC 4)."""
+        in_world = self._directions() @ self.world_to_camera[..., None, :, :3]
+        return self.position, torch.nn.functional.normalize(in_world, dim=-1)
+
+    def secants(self) -> Float[Tensor, "*#c height width"]:
+        """Distance along the ray through each pixel centre per metre along the optical axis."""
+        return self._directions().norm(dim=-1)
+
+    def _directions(self) -> Float[Tensor, "*#c height width 3"]:
+        """Directions of the rays through pixel centres in the camera's axes, z = 1."""
         k = self.intrinsics[..., None, None]
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=k.dtype, device=k.device) + 0.5,
@@ -38,9 +47,7 @@ class Camera(TensorRecord):
         )
         y = (v - k[..., 1, 2, :, :]) / k[..., 1, 1, :, :]
         x = (u - k[..., 0, 2, :, :] - k[..., 0, 1, :, :] * y) / k[..., 0, 0, :, :]
-        in_camera = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-        in_world = in_camera @ self.world_to_camera[..., None, :, :3]
-        return self.position, torch.nn.functional.normalize(in_world, dim=-1)
+        return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
     def moved_in_picture(self, right: float, down: float) -> Camera:
         """Shift the principal point, so that what was seen at pixel (u, v) is seen at (u + right, v + down)."""

@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from editing_people import anybody
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.human_file import load_human, save_human
-from tiny_model import save_tiny_checkpoint, tiny_model
+from support.tiny import anybody, save_tiny_checkpoint, tiny_model
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 

@@ -19,7 +19,7 @@ from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
 from primdiffusion.runtime.failures import MissingPackageError
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 VOXEL = 0.03
 STILL = torch.eye(3, 4).tolist()

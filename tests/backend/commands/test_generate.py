@@ -23,8 +23,7 @@ from primdiffusion.human_file import load_human
 from primdiffusion.render.march import RELEASED
 from primdiffusion.render.reference import march_reference
 from support.runs import ended_at_each_report
-from tiny_encoder import save_tiny_encoder
-from tiny_model import model_of_two_kinds, save_tiny_checkpoint
+from support.tiny import model_of_two_kinds, save_tiny_checkpoint, save_tiny_encoder
 
 
 @pytest.fixture

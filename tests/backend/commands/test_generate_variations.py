@@ -15,7 +15,7 @@ from primdiffusion.formats.requests import VariationsRequest
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from support.runs import ended_at_each_report
-from tiny_model import model_of_two_kinds
+from support.tiny import model_of_two_kinds
 
 
 @pytest.fixture

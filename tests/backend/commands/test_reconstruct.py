@@ -23,8 +23,7 @@ from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction.from_captures import reconstruct
 from support.runs import ended_at_each_report
-from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
-from tiny_model import save_tiny_checkpoint
+from support.tiny import TINY, save_tiny_checkpoint, save_tiny_encoder, tiny_encoder
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 FIRST, SECOND = "person_000000", "person_000001"

@@ -19,7 +19,7 @@ from primdiffusion.reconstruction import from_pictures
 from primdiffusion.reconstruction.posture_start import standing
 from primdiffusion.render.march import march
 from support.runs import ended_at_each_report
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "posture.json", "side.png"]
 COLOURS = torch.tensor([30.0, -20.0, 5.0])

@@ -18,7 +18,7 @@ from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.runtime.failures import describe
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 WIDTH, HEIGHT = 40, 56
 STILL = torch.eye(3, 4).tolist()

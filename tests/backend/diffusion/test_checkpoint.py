@@ -19,7 +19,7 @@ from primdiffusion.primitives.primitives import GRID, K
 from safetensors import safe_open
 from safetensors.torch import save_file
 from support.errors import refused
-from tiny_model import model_of_two_kinds, save_tiny_checkpoint, tiny_model
+from support.tiny import model_of_two_kinds, save_tiny_checkpoint, tiny_model
 
 LEVELS = ("50", "100", "300", "500", "700", "900")
 

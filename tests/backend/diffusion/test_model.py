@@ -13,7 +13,7 @@ from primdiffusion.files.tensor_file import read, save
 from primdiffusion.human import generate, generate_batch
 from primdiffusion.primitives.primitives import GRID, K, S
 from support.errors import refused
-from tiny_model import save_tiny_checkpoint
+from support.tiny import save_tiny_checkpoint
 
 
 @pytest.fixture(scope="module")

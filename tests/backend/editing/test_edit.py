@@ -7,7 +7,6 @@ import json
 import pytest
 import torch
 from diffusion_people import small_model
-from editing_people import anybody, slab_model
 from primdiffusion.diffusion.model import seeded
 from primdiffusion.diffusion.schedule import dense_steps, early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
@@ -19,7 +18,7 @@ from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import anybody, slab_model, tiny_model
 
 FIELDS = ("rgb", "density", "delta_scale")
 TOP = region_of(["top"])

@@ -9,7 +9,7 @@ from primdiffusion.editing.reshaping import SHARE, box_growth, reshaped
 from primdiffusion.human import Human, generate, place
 from primdiffusion.primitives.anchors import Anchors, cell_sides, default_anchors
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 WIDER = torch.tensor([0.3, 2.6, 1.0, 2.2, 0.3, 4.0, 1.5, -1.7, -0.4, -0.3])
 

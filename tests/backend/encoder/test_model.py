@@ -35,7 +35,7 @@ from primdiffusion.render.march import march
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from support.errors import refused
-from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
+from support.tiny import TINY, save_tiny_encoder, tiny_encoder
 
 
 def blank_views(count: int = 2, pixels: int = 24) -> Views:

@@ -13,7 +13,7 @@ from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.primitives.primitives import GRID, K, Payload, S, pack
 from support.errors import refused
-from tiny_encoder import TINY
+from support.tiny import TINY
 
 SMALL = {
     "stem": (2, 2, 4), "grid": (32, 8, 8), "motion": 32, "attention_width": 8, "attention_heads": 2, "fused": 4,

@@ -11,7 +11,7 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from primdiffusion.render.march import MarchSettings
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
 from support.errors import refused
-from tiny_encoder import save_tiny_encoder
+from support.tiny import save_tiny_encoder
 
 COARSE = MarchSettings(step=0.016)
 

@@ -23,7 +23,7 @@ from primdiffusion.evaluation.tables import (
     table,
 )
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 
 def judged(count: int, seed: int, shift: float = 0.0, correct: list[float] | None = None) -> Scores:

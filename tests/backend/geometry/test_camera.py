@@ -41,6 +41,8 @@ def test_rays_pass_through_the_points_that_project_to_their_pixel_centres():
     v, u = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     torch.testing.assert_close(pixel, torch.stack([u, v], -1).double())
     torch.testing.assert_close(direction.norm(dim=-1), torch.ones(48, 64).double())
+    depth = camera.project(origin + camera.secants()[..., None] * direction)[1]
+    torch.testing.assert_close(depth, torch.ones(48, 64).double())
 
 
 @pytest.mark.parametrize(("stride", "left", "top"), [(1, 0, 0), (3, 1, 0), (3, 2, 2)])

@@ -30,8 +30,7 @@ from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
 from support.errors import refused
-from tiny_encoder import TINY, tiny_encoder
-from tiny_model import SLOW, tiny_model
+from support.tiny import SLOW, TINY, tiny_encoder, tiny_model
 
 MODEL = tiny_model()
 PRIOR = MODEL.denoiser.prior

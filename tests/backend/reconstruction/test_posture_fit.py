@@ -34,7 +34,7 @@ from primdiffusion.reconstruction.posture_start import (
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 from support.errors import refused
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 MODEL = tiny_model()
 PAYLOAD = MODEL.decode(MODEL.denoiser.prior.mean).map(torch.Tensor.clone)

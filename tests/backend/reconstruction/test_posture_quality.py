@@ -22,7 +22,7 @@ from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, 
 from primdiffusion.reconstruction.posture_start import standing
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
-from tiny_model import tiny_model
+from support.tiny import tiny_model
 
 MODEL, SIDE = tiny_model(), 96
 COMPONENTS = PriorFit.of(MODEL)

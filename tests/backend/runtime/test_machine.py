@@ -31,8 +31,8 @@ from primdiffusion.runtime.device import (
 from primdiffusion.runtime.machine import choose_device, memory, share_processors
 from primdiffusion.runtime.worker_process import THREAD_COUNTS, each, run_in_process
 from support.errors import refused
+from support.tiny import tiny_model
 from thread_bytes import by_threads
-from tiny_model import tiny_model
 
 
 def test_peak_memory_keeps_what_was_given_back_and_is_none_of_the_program_that_started_this_one():

@@ -15,7 +15,7 @@ from primdiffusion.people.stored_people import PersonFolder, read_person
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
 from support.errors import refused
-from tiny_encoder import save_tiny_encoder, tiny_encoder
+from support.tiny import save_tiny_encoder, tiny_encoder
 
 AS_ENCODED = EncodeSettings()
 FIRST, SECOND = "person_000000", "person_000001"

@@ -15,13 +15,14 @@ from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
+from primdiffusion.runtime.worker_process import LOCK
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training.fit import MODEL, EncoderTask, fit, run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
 from primdiffusion.training.fit_data import fit_batches
 from primdiffusion.training.fit_losses import volume_loss
 from primdiffusion.training.loop import begin_phase
-from primdiffusion.training.run_folder import LOCK, METRICS, PICTURES, Metrics
+from primdiffusion.training.run_folder import METRICS, PICTURES, Metrics
 from safetensors.torch import load_file
 from support.errors import refused
 from support.runs import rows, sentence

@@ -1,17 +1,26 @@
-"""A checkpoint small enough to make in a test: person prior without networks, a codec of four numbers a primitive."""
+"""Models small enough to make in a test, and humans of noise.
+
+`tiny_model` is a person prior without networks and a codec of four numbers a primitive; `slab_model` the paper's kind;
+`tiny_encoder` has few channels, is untrained, and shows what it looked up in the pictures.
+"""
 
 import dataclasses
 from pathlib import Path
 
 import torch
 from primdiffusion.diffusion.checkpoint import save_checkpoint
-from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec
+from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
-from primdiffusion.diffusion.schedule import SCHEDULES
-from primdiffusion.primitives.primitives import GRID, K, S
+from primdiffusion.diffusion.schedule import SCHEDULES, linear
+from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.encoder.config import EncoderConfig
+from primdiffusion.encoder.model import EncoderModel, save_encoder
+from primdiffusion.encoder.network import Encoder
+from primdiffusion.human import Human
+from primdiffusion.primitives.primitives import GRID, K, Payload, S
 
 FULL_DENSITY = 100.0
 CHANNELS = 4
@@ -72,3 +81,44 @@ def save_tiny_checkpoint(path: Path, local: LocalUNetConfig | None = None) -> Pa
     """Writes `tiny_model` as a checkpoint file."""
     save_checkpoint(path, tiny_model(local), "linear")
     return path
+
+
+TINY = EncoderConfig(
+    stem=(2, 2, 4), grid=(4, 4), motion=4, attention_width=4, attention_heads=1, fused=4, colour=(2, 2),
+    density=(2, 2), finest=2, scale=(4,),
+)  # fmt: skip
+
+
+def tiny_encoder() -> EncoderModel:
+    """The same in every test."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return EncoderModel(Encoder(TINY).eval().requires_grad_(False), {"name": "tiny encoder"})
+
+
+def save_tiny_encoder(path: Path) -> Path:
+    """Writes `tiny_encoder` as a checkpoint file."""
+    save_encoder(path, tiny_encoder())
+    return path
+
+
+SMALLEST = UNetConfig(width=32, multipliers=(1,) * 5, blocks=1)
+
+
+def anybody(seed: int) -> Human:
+    """Noise for a payload, which no codec holds without loss; betas and delta scales that are nobody's default."""
+    generator = torch.Generator().manual_seed(seed)
+    payload = Payload(
+        torch.rand(K, 3, S, S, S, generator=generator),
+        FULL_DENSITY * torch.rand(K, S, S, S, generator=generator),
+        0.8 + 0.4 * torch.rand(K, 3, generator=generator),
+    )
+    return Human(payload, torch.randn(10, generator=generator), {"seed": seed, "full_density": FULL_DENSITY})
+
+
+def slab_model() -> DiffusionModel:
+    """The paper's kind of model, with few channels and weights that are not those of the start, which guess 0."""
+    torch.manual_seed(0)
+    denoiser = SlabUNet(SMALLEST).eval().requires_grad_(False)
+    torch.nn.init.normal_(denoiser.out[2].weight, std=0.01)
+    return DiffusionModel(denoiser, linear(), WholeSlab(), STANDARD_SHAPES, FULL_DENSITY, {"name": "slab"})
