@@ -71,6 +71,7 @@ def main() -> None:
     count = "4" if arguments.quick else "6"
     stage("pictures by the marcher", "benchmarks/demo_pictures.py", *made,
           "--frame", str(SHOWN), "--count", count, "--out", out)  # fmt: skip
+    figures["demo_seconds_after_setup"] = time.perf_counter() - start
     if arguments.json is not None and arguments.assets is not None:
         options = ["--quick"] if arguments.quick else []
         stage("people against meshes", "benchmarks/people.py", "--assets", arguments.assets, *options)

@@ -104,17 +104,24 @@ def register(_arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def person(arguments: argparse.Namespace) -> dict[str, float | None]:
-    """One person: building, frames with volumes shown, motion."""
+    """One person: objects and file, building, frames with volumes shown, motion; objects that Delete leaves."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
 
     context = bpy.context
+    blend = Path(bpy.data.filepath)
+    empty_bytes = blend.stat().st_size
     start = time.perf_counter()
     folder = arguments.folder / "person"
     armature = build_human(context, folder / "person.human.safetensors")
+    building = time.perf_counter() - start
+    objects = len(bpy.data.objects)
+    bpy.ops.wm.save_mainfile(compress=True)
+    blend_mb = (blend.stat().st_size - empty_bytes) / 1e6
+    start = time.perf_counter()
     bpy.ops.primdiffusion.volumes_in_viewport()
     context.view_layer.update()
-    built = time.perf_counter() - start
+    built = building + time.perf_counter() - start
     context.view_layer.objects.active = armature
 
     motion = _amass_file(arguments.folder / "amass.npz")
@@ -122,11 +129,16 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     bpy.ops.primdiffusion.import_motion(filepath=str(motion))
     keyed = time.perf_counter() - start
     figures: dict[str, float | None] = {
+        "add_human_seconds": building,
         "build_seconds": built,
+        "objects_of_a_human": objects,
+        "blend_mb_a_human": blend_mb,
         "amass_1500_seconds": keyed,
         "frame_ms": _frame_ms(context.scene),
     }
-    return figures
+    armature.select_set(True)
+    bpy.ops.object.delete()
+    return {**figures, "objects_left_after_delete": len(bpy.data.objects)}
 
 
 def memory(arguments: argparse.Namespace) -> dict[str, float]:

@@ -12,6 +12,8 @@ Measured without a window, which adds its redraws: the seconds from the child's 
 memory with undo, milliseconds of a frame change, and rows of the Outliner as Blender opens them (collections open,
 objects closed). second_* are the same with another human in the scene. panels_open, sidebar_px, panel_classes and
 operators are of `sidebar.py`.
+first_press_seconds is from the press of Generate Human until the human stands where nothing was compiled yet,
+first_press_ratio that to the faster of two later presses, each in a Blender of its own.
 proxy_cpu_seconds is the processor time of `primdiffusion export` of a textured mesh, of the default checkpoint's human
 with seed 7.
 
@@ -100,6 +102,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="primdiffusion_first_sight_") as folder:
         figures = measured(Path(folder)) | sidebar.measured()
         figures["proxy_cpu_seconds"] = proxy_cpu_seconds(Path(folder))
+        first, *later = (press_seconds(Path(folder) / "cache") for _ in range(3))
+        figures |= {"first_press_seconds": first, "first_press_ratio": first / min(later)}
     read = [json.loads(path.read_text(encoding="utf-8")) for path in arguments.window or ()]
     window = in_window(read) if read else before
     report({**{name: window.get(name) for name in WINDOW}, **figures}, arguments.json)
@@ -138,6 +142,22 @@ def proxy_cpu_seconds(folder: Path) -> float:
     person, before = folder / "seven" / "person.human.safetensors", children_seconds()
     subprocess.run([*primdiffusion, "export", str(person), "--out", str(folder / "proxy.glb")], check=True)
     return children_seconds() - before
+
+
+def press_seconds(cache: Path) -> float:
+    """Seconds of Generate Human in a new Blender whose compiled functions are in `cache`."""
+    press = """
+import time, blender_isolated, bpy, blender_primdiffusion
+blender_primdiffusion.register()
+began = time.perf_counter()
+bpy.ops.primdiffusion.generate(seed=7)
+print("pressed", time.perf_counter() - began, len(bpy.context.selected_objects), flush=True)
+"""
+    places = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
+    about = {"PYTHONPATH": places, "PRIMDIFFUSION_PYTHON": sys.executable, "PRIMDIFFUSION_CACHE": str(cache)}
+    command = [sys.executable, "-c", press]
+    done = subprocess.run(command, env={**os.environ, **about}, capture_output=True, text=True, check=True)
+    return float(next(line for line in done.stdout.splitlines() if line.startswith("pressed")).split()[1])
 
 
 def children_seconds() -> float:

@@ -219,7 +219,7 @@ def walk() -> Mapping[str, float | None]:
         path = Path(folder) / "walk.json"
         subprocess.run([sys.executable, str(ROOT / "benchmarks" / "walk.py"), "--json", str(path)], check=True)
         figures = json.loads(path.read_text(encoding="utf-8"))
-    return {name: figures[name] for name in ("walk_extension_files", "walk_backend_files")}
+    return {name: figures[name] for name in ("walk_extension_files", "walk_backend_files", "open_walk_files")}
 
 
 def _imports(tree: ast.AST, package: str, in_function: bool = False) -> Iterator[Import]:

@@ -5,8 +5,8 @@ side, 512 x 512. splat_psnr is that of Cycles (128 samples) against the engine, 
 of the two views; splat_cycles_cpu_seconds is a frame of 16 samples. splat_update_ms is the fastest evaluation of a new
 pose. crowd_people are instances of one human, which crowd.png shows.
 
-The constants of `scene/splats.py` were fitted to two views of an earlier sample human, so splat_psnr is of a person
-whom they have not seen. `--human FILE --yaw DEGREES DEGREES` measures others, without the crowd.
+The constants of `scene/splats.py` were fitted to one view each of four people, the sample human among them.
+`--human FILE --yaw DEGREES DEGREES` measures others, without the crowd.
 """
 
 from __future__ import annotations

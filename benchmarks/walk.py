@@ -1,4 +1,5 @@
-"""Counts the files of this repository that run between pressing Generate and the volumes in the scene.
+"""Counts the files of this repository that run between pressing Generate and the human in the scene, and those of the
+extension that run while a .blend with that human is opened (open_walk_files).
 
     python benchmarks/walk.py
     python benchmarks/walk.py --json FILE
@@ -63,22 +64,22 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory(prefix="primdiffusion_walk_") as name:
         folder = Path(name)
-        logs = {program: folder / program for program in ("extension", "backend")}
+        logs = {program: folder / program for program in ("extension", "backend", "open")}
         os.environ["PRIMDIFFUSION_PYTHON"] = str(_traced_python(folder / "python", logs["backend"]))
-        volumes = _generate(folder, logs["extension"])
+        volumes = _generate(folder, logs)
         figures: dict[str, float | None] = {"walk_volumes": volumes}
         for program, log in logs.items():
             passed = log.read_text(encoding="utf-8").splitlines()
             print(f"{program}:", *(Path(path).relative_to(ROOT) for path in passed), sep="\n  ", end="\n\n")
-            figures[f"walk_{program}_files"] = len(passed)
+            figures["open_walk_files" if program == "open" else f"walk_{program}_files"] = len(passed)
         record.report(figures, arguments.json)
     sys.stdout.flush()
     blender_isolated.remove()
     os._exit(0)  # bpy as a module may hang at exit
 
 
-def _generate(folder: Path, log: Path) -> int:
-    """Generate a person; returns the number of volumes in the scene."""
+def _generate(folder: Path, logs: dict[str, Path]) -> int:
+    """Generate a person, save and open the file; returns the number of volumes in the scene."""
     import bpy  # after blender_isolated
 
     sys.path.insert(0, str(ROOT))
@@ -87,15 +88,22 @@ def _generate(folder: Path, log: Path) -> int:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "walk.blend"))
     blender_primdiffusion.register()
-    trace = Trace(ROOT / "blender_primdiffusion", log)
+    trace = Trace(ROOT / "blender_primdiffusion", logs["extension"])
     trace.start()
     try:
         bpy.context.scene.primdiffusion.steps = STEPS
         bpy.ops.primdiffusion.generate(seed=SEED)
     finally:
         trace.stop()
+    volumes = len(bpy.data.volumes)
+    bpy.ops.wm.save_mainfile()
+    trace = Trace(ROOT / "blender_primdiffusion", logs["open"])
+    trace.start()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    bpy.context.view_layer.update()
+    trace.stop()
     blender_primdiffusion.unregister()
-    return len(bpy.data.volumes)
+    return volumes
 
 
 def _traced_python(path: Path, log: Path) -> Path:

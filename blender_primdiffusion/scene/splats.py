@@ -23,16 +23,13 @@ SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
 
 SPLATS_AVAILABLE = bpy.app.version >= (5, 3)
 """Whether this Blender has Gaussian splats."""
-WIDTH = (0.465, 0.465, 0.367)
+WIDTH = (0.44, 0.44, 0.375)
 """Standard deviations along T, B, N, in voxel spacings; the trilinear kernel's own is .408."""
-OPACITY_OF_VOXEL = np.geomspace(0.004, 6, 14)[2:-2]
-GAIN = np.array([0.3, 3.7, 5.0, 2.7, 1.8, 1.7, 1.8, 2.0, 3.0, 5.5])
-"""Optical depth of a splat relative to its voxel's opacity, of voxels of the opacities above. Splats composite as
-1 - product(1 - a), while the marcher adds opacities until 1 and so occludes sooner; and what is faint along the normal
-is seen along the skin at the silhouette. These and WIDTH are least squares of pictures of splats and the marcher."""
-COVERED = (0.0, 0.75, 1.5, 2.25)
-SHARE_IF_COVERED = (1.0, 0.8, 0.5, 0.0)
-"""What is left of it below voxels whose opacities add up to COVERED: what no picture shows is left out."""
+GAIN = 2.1
+"""Optical depth of a splat relative to its voxel's opacity. Splats composite as 1 - product(1 - a), while the marcher
+adds opacities until 1 and so occludes sooner. GAIN and WIDTH are least squares of pictures of four people."""
+COVERED = 1.0
+"""Voxels below others of their cell whose opacities add up to this are left out: the marcher does not reach them."""
 FAINTEST = 0.02
 """Opacity below which a splat is left out."""
 LEAST = 0.004
@@ -66,12 +63,9 @@ def splats_of(human: RestHuman) -> Splats:
     spacing = half_extent * 2 / (size - 1)
     along_normal = payload.density * window * spacing[:, 2, None, None, None]
     covered = np.cumsum(along_normal[:, ::-1], 1)[:, ::-1] - along_normal  # by the voxels further out
-    cell, d, h, w = np.nonzero((along_normal >= LEAST) & (covered < COVERED[-1]))
-    raw = along_normal[cell, d, h, w]
-    gain = np.exp(np.interp(np.log(raw), np.log(OPACITY_OF_VOXEL), np.log(GAIN)))
-    gain *= np.interp(covered[cell, d, h, w], COVERED, SHARE_IF_COVERED)
+    cell, d, h, w = np.nonzero((along_normal >= LEAST) & (covered < COVERED))
     in_plane = np.sqrt(spacing[:, 0] * spacing[:, 1]) / spacing[:, 2]
-    opacity = 1 - np.exp(-gain * raw * in_plane[cell])
+    opacity = 1 - np.exp(-GAIN * along_normal[cell, d, h, w] * in_plane[cell])
     shown = opacity >= FAINTEST
     cell, d, h, w, opacity = (values[shown] for values in (cell, d, h, w, opacity))
     order = np.argsort(_lattice(d, h, w), kind="stable")

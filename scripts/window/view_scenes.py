@@ -56,7 +56,7 @@ def shadings(module: str, python: str) -> Steps:
 
 
 def rendered(module: str, python: str) -> Steps:
-    """The engine's view: a human among solids, turned step by step, from the side in parallel, cut by a border."""
+    """The engine's view: a human among solids, turned step by step, from the side in parallel, from the camera."""
     yield from with_people(module, python, FIRST_SEED)
     for location, size in (((0.5, -0.2, 0.4), 0.8), ((0.0, 0.0, 0.0), 0.1)):
         bpy.ops.mesh.primitive_cube_add(size=size, location=location)
@@ -77,6 +77,11 @@ def rendered(module: str, python: str) -> Steps:
     around.view_perspective = "ORTHO"
     yield 20.0
     yield "rendered_parallel"
+    bpy.ops.object.camera_add(location=(0.4, -2.6, 1.3), rotation=(1.5, 0.0, 0.1))
+    bpy.context.scene.camera = bpy.context.object
+    around.view_perspective = "CAMERA"
+    yield 20.0
+    yield "rendered_from_the_camera"
     bpy.context.scene.primdiffusion_render.view = "ALPHA"
     yield 5.0
     yield "rendered_says_that_alpha_is_for_renders"
