@@ -8,10 +8,10 @@ from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser
-from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.primitives.primitives import GRID, K, S
+from support.priors import of_whole_body
 
 FULL_DENSITY = 100.0
 CHANNELS = 4
@@ -36,7 +36,7 @@ def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
     )
     person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
     person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
-    prior = PersonPrior.of_whole_body(
+    prior = of_whole_body(
         mean=torch.zeros(CHANNELS, GRID, GRID),
         basis=person.flatten(1),
         parity=torch.ones(COMPONENTS),
