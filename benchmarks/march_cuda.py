@@ -7,9 +7,9 @@ of a forward and a backward pass in one graph. cuda_pipelined is the time of a p
 cuda_launch_share the part of cuda_forward in which no kernel runs. The ceilings are measured on the same device in the
 same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, without reuse, 128 bytes of voxels.
 
-`--cases` also runs the tests of the marcher on the device, `--train` times training steps (`train_cuda.py`),
+`--train` also times training steps (`train_cuda.py`), `--cases` runs the tests of the marcher on the device,
 `--kernels` prints the time of each kernel, `--sweep` that of different program shapes. A part that fails prints its
-traceback, and the others go on.
+traceback, and the others go on; figures are written after each. All but the sweep should take less than eight minutes.
 
 It needs a CUDA device, torch for CUDA, the triton that this torch requires, and the package's own requirements; nothing
 is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda.py`. `--write-person FILE` on any
@@ -51,6 +51,7 @@ import triton
 import triton.language as tl
 
 ROOT = Path(__file__).resolve().parents[1]
+DEVICE = "cuda"
 FINE, DEFAULT = UNIFORM_MILLIMETRE, MarchSettings()
 SIZES = (256, 512, 1024, 2048)
 BATCHES = (4, 16)
@@ -98,7 +99,7 @@ def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camer
     names = [field.name for field in dataclasses.fields(Primitives)]
     batch = Primitives(**{name: torch.stack([getattr(person, name) for person in boxes]) for name in names})
     camera = portrait(size).map(lambda tensor: tensor.expand(views, *tensor.shape).clone())
-    return batch.to("cuda", torch.float32), camera.to("cuda", torch.float32)
+    return batch.to(DEVICE, torch.float32), camera.to(DEVICE, torch.float32)
 
 
 def forward_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, shapes: Shapes = Shapes()) -> float:  # noqa: B008
@@ -305,7 +306,7 @@ def training() -> Figures:
     """Milliseconds of training steps."""
     from train_cuda import training_figures
 
-    return training_figures()
+    return {**training_figures(kernels_ms)}
 
 
 def variants() -> Iterator[Shapes]:
@@ -351,8 +352,8 @@ def main() -> None:
         made.update(torch.load(arguments.person, weights_only=True))
     figures: Figures = {}
     parts = [exactness, graphs, speed, launches]
-    parts += [part for part, wanted in ((cases, arguments.cases), (training, arguments.train)) if wanted]
-    parts += [part for part, wanted in ((print_kernels, arguments.kernels), (print_sweep, arguments.sweep)) if wanted]
+    more = ((training, "train"), (cases, "cases"), (print_kernels, "kernels"), (print_sweep, "sweep"))
+    parts += [part for part, name in more if getattr(arguments, name)]
     failed = []
     for part in parts:
         began = time.perf_counter()

@@ -309,7 +309,9 @@ def prepared(
     prior = fit_prior(people, codec, vocabulary, PriorConfig(), whole)  # pyright: ignore[reportArgumentType] - mirrors alike
     records = {"codec": codec, "people": people, "prior": prior}
     contents = {
-        f"{part}.{name}": value.contiguous() for part, one in records.items() for name, value in vars(one).items()
+        f"{part}.{field.name}": getattr(one, field.name).contiguous()
+        for part, one in records.items()
+        for field in dataclasses.fields(one)
     }
     with written_whole(stored) as unfinished:
         unfinished.write_bytes(save(contents))

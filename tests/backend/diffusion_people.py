@@ -13,6 +13,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.primitives.primitives import GRID, K, S
+from support.priors import of_whole_body
 
 CHANNELS, COMPONENTS = 4, 6
 VOCABULARY = AttributeVocabulary({"outfit": ("jeans", "suit")}, {})
@@ -32,7 +33,7 @@ def random_prior(
         return torch.randn(size, generator=generator, dtype=torch.float64)
 
     size = shape[0] * shape[1] * shape[2]
-    return PersonPrior.of_whole_body(
+    return of_whole_body(
         mean=normal(*shape),
         basis=torch.linalg.qr(normal(size, components))[0].T.contiguous(),
         parity=torch.ones(components),

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
+from support.priors import of_whole_body
 from voxel_baseline import (
     BOUNDS,
     SIDE,
@@ -111,7 +111,7 @@ def test_codec_gives_back_what_lies_in_its_basis(codec):
 def model(codec) -> VoxelModel:
     shape = (16, len(codec.cells), 1)
     size, generator = shape[0] * shape[1], torch.Generator().manual_seed(0)
-    prior = PersonPrior.of_whole_body(
+    prior = of_whole_body(
         mean=torch.zeros(shape),
         basis=torch.linalg.qr(torch.randn(size, 3, generator=generator))[0].T.contiguous(),
         parity=torch.ones(3),

@@ -12,7 +12,6 @@ from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser
-from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES, linear
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
@@ -21,6 +20,7 @@ from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.human import Human
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
+from support.priors import of_whole_body
 
 FULL_DENSITY = 100.0
 CHANNELS = 4
@@ -45,7 +45,7 @@ def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
     )
     person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
     person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
-    prior = PersonPrior.of_whole_body(
+    prior = of_whole_body(
         mean=torch.zeros(CHANNELS, GRID, GRID),
         basis=person.flatten(1),
         parity=torch.ones(COMPONENTS),

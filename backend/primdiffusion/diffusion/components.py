@@ -10,6 +10,7 @@ once; what does not depend on the noise is computed once (`Block.of_kinds`).
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import torch
@@ -66,7 +67,12 @@ class PersonComponents(TensorRecord):
 
     def bases(self) -> tuple[Tensor, ...]:
         """The components of each part [n, cells, d]."""
-        return self.basis.split(self.part.bincount().tolist(), dim=1)
+        return self.basis.split(self._cells, dim=1)
+
+    @functools.cached_property
+    def _cells(self) -> list[int]:
+        """Cells of each part; waits for the device."""
+        return self.part.bincount().tolist()
 
     def picture_variance(self, variance: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
         """Variance of `picture` for independent coefficients of these variances."""

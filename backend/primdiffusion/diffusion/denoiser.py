@@ -328,15 +328,26 @@ class PersonDenoiser(nn.Module):
         self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
     ) -> Float[Tensor, "b r"]:
         """Denoise person coefficients."""
+        likely = self.likely_coefficients(y, t, condition)
+        return likely if self.person is None else self.corrected(y, likely, t, condition)
+
+    def likely_coefficients(
+        self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None
+    ) -> Float[Tensor, "b r"]:
+        """The closed-form guess of person coefficients."""
+        return self.prior.denoise_coefficients(y, *self.schedule.levels(t, y), condition)
+
+    def corrected(
+        self, y: Float[Tensor, "b r"], likely: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Tensor | None
+    ) -> Float[Tensor, "b r"]:
+        """The closed-form guess with the correction of the network over components, which must be there."""
+        assert self.person is not None
         signal, noise = self.schedule.levels(t, y)
-        guess = self.prior.denoise_coefficients(y, signal, noise, condition)
-        if self.person is None:
-            return guess
         std = self.component_std
         total = (signal**2 * std**2 + noise**2).sqrt()
         with self._precision(y):
-            correction = self.person(y / total, guess / std, t, condition)
-        return guess + std * noise / total * correction
+            correction = self.person(y / total, likely / std, t, condition)
+        return likely + std * noise / total * correction
 
     def rest(
         self,

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -35,8 +35,8 @@ IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""
 CLEAN_NOISE = 1e-3
 """Noise of coefficients that are read as they are; some directions have no variance of their own."""
-TOGETHER = 8
-"""Samples whose distances to all kinds are in memory at once."""
+TOGETHER, TOGETHER_ON_CUDA = 8, 32
+"""Samples whose distances to all kinds are in memory at once; more on CUDA devices, where launches take the time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,30 +67,6 @@ class PersonPrior(PersonComponents):
     kind: Float[Tensor, "g m x"]
     """The condition (`AttributeVocabulary.encode`) of each kind; x may be 0."""
 
-    @classmethod
-    def of_whole_body(
-        cls,
-        mean: Float[Tensor, "c h w"],
-        basis: Float[Tensor, "r d"],
-        parity: Float[Tensor, "r"],
-        rest_variance: Float[Tensor, "c h w"],
-        log_weight: Float[Tensor, "g m"],
-        centre: Float[Tensor, "g m r"],
-        axes: Float[Tensor, "g r r"],
-        variance: Float[Tensor, "g r"],
-        kind: Float[Tensor, "g m x"],
-    ) -> PersonPrior:
-        """One part, whose components are rows over whole channels, with one Gaussian for each group."""
-        cells, groups = mean[0].numel(), len(log_weight)
-        return cls(
-            mean=mean, basis=basis.unflatten(1, (-1, cells)).mT.contiguous(),
-            part=torch.zeros(cells, dtype=torch.int64), parity=parity, rest_variance=rest_variance,
-            log_weight=log_weight, centre=centre, axes=axes, variance=variance, left=variance.new_zeros(groups),
-            head=torch.zeros(log_weight.shape, dtype=torch.int64), head_axes=axes.new_zeros(1, 0, 0),
-            head_variance=axes.new_zeros(1, 0), head_left=axes.new_zeros(1),
-            shared=axes.new_zeros(groups, 0, len(parity)), head_shared=axes.new_zeros(1, 0, 0), kind=kind,
-        )  # fmt: skip
-
     def log_weights(self, condition: Float[Tensor, "b x"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
         """Return the log weights of the kinds, lowered by IMPOSSIBLE where a kind contradicts the condition.
 
@@ -117,7 +93,7 @@ class PersonPrior(PersonComponents):
             log_weights, blocks = log_weights[:, possible], (blocks[0].chosen(possible), blocks[1].chosen(possible))
         found = [
             expected(blocks, weights, *(_double(each) for each in chunk))
-            for weights, *chunk in zip(*(each.split(TOGETHER) for each in (log_weights, y, signal, noise)), strict=True)
+            for weights, *chunk in _chunks(log_weights, y, signal, noise)
         ]
         return torch.cat(found).to(y)
 
@@ -128,7 +104,7 @@ class PersonPrior(PersonComponents):
         one = torch.ones(len(c), 1, device=c.device)
         found = [
             posterior(blocks, weights, *(_double(each) for each in chunk))[0]
-            for chunk in zip(*(each.split(TOGETHER) for each in (c, one, CLEAN_NOISE * one)), strict=True)
+            for chunk in _chunks(c, one, CLEAN_NOISE * one)
         ]
         shares = torch.zeros(len(c), self.log_weight.numel()).to(found[0])
         shares[:, real] = torch.cat(found)
@@ -309,6 +285,11 @@ def _drawn(
         return drawn
     white = normal(len(axes), axes.shape[2])
     return drawn + left.sqrt()[:, None] * (white - torch.einsum("bi,bai,baj->bj", white, axes, axes))
+
+
+def _chunks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    together = TOGETHER_ON_CUDA if tensors[0].device.type == "cuda" else TOGETHER
+    return zip(*(tensor.split(together) for tensor in tensors), strict=True)
 
 
 def _double(tensor: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import torch
@@ -40,9 +41,8 @@ class Schedule(TensorRecord):
 
     def levels(self, t: Int[Tensor, "b"], like: Tensor) -> tuple[Tensor, Tensor]:
         """Signal and noise factors of a batch of steps, shaped [b, 1, ...] to multiply `like` [b, ...]."""
-        # rounded before it moves, as Apple GPUs have no float64
         shape = (-1, *([1] * (like.ndim - 1)))
-        every = self.alpha_bar.sqrt().to(like), (1.0 - self.alpha_bar).sqrt().to(like)
+        every = _levels(self.alpha_bar, like.dtype, like.device)
         signal, noise = (level.index_select(0, t).reshape(shape) for level in every)
         return signal, noise
 
@@ -85,6 +85,14 @@ class Schedule(TensorRecord):
     def _alpha(self, t: int, t_prev: int) -> float:
         _check_back(t, t_prev)
         return (self.signal(t) / self.signal(t_prev)) ** 2
+
+
+@functools.lru_cache(maxsize=16)
+def _levels(alpha_bar: Tensor, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Signal and noise at every step: copying them to a device waits for it."""
+    # rounded before it moves, as Apple GPUs have no float64
+    every = alpha_bar.sqrt().to(dtype), (1.0 - alpha_bar).sqrt().to(dtype)
+    return every[0].to(device), every[1].to(device)
 
 
 def linear(length: int = 1000, first: float = 1e-4, last: float = 2e-2) -> Schedule:

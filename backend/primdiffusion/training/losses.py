@@ -6,8 +6,11 @@ Random numbers are drawn on the device of their generator, which must be that of
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +21,7 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
+from primdiffusion.render.cuda.graph import RecordedLoss
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
 
@@ -42,52 +46,81 @@ def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> 
     return (weight / weight.mean(1, keepdim=True) * error.flatten(1).square()).mean()
 
 
+class Objective(ABC):
+    """Loss of one of the denoiser's networks, on a CUDA device recorded with its gradients."""
+
+    name: ClassVar[str]
+    denoiser: PersonDenoiser
+
+    @property
+    def network(self) -> nn.Module:
+        """The network to train."""
+        network = getattr(self.denoiser, self.name)
+        if network is None:
+            raise ValueError("this denoiser was configured without the network that is to be trained: give it a size")
+        return network
+
+    @abstractmethod
+    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+        """Draw people and levels, and compute what the network does not change."""
+
+    @abstractmethod
+    def error(self, *batch: Tensor) -> Tensor:
+        """Weighted x0 error of a batch; does not wait for the device."""
+
+    def loss(self, generator: torch.Generator) -> Tensor:
+        """Weighted x0 error of a random batch at random levels."""
+        return self._recorded(*self.batch(generator))
+
+    @functools.cached_property
+    def _recorded(self) -> RecordedLoss:
+        return RecordedLoss(self.error, self.network)
+
+
 @dataclasses.dataclass
-class PersonObjective:
+class PersonObjective(Objective):
     """Loss of the network over person components; cheap, as it needs no latent grids."""
 
+    name = "person"
     denoiser: PersonDenoiser
     coefficients: Float[Tensor, "n r"]
     people: LatentSet
     vocabulary: AttributeVocabulary
     config: PhaseConfig
 
-    @property
-    def network(self) -> nn.Module:
-        """The network to train."""
-        return _present(self.denoiser.person)
-
-    def loss(self, generator: torch.Generator) -> Tensor:
-        """Weighted x0 error of a random batch at random levels."""
+    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+        """Draw noisy coefficients; return them with their closed-form guess, step, condition and the clean ones."""
         spread = float(self.denoiser.component_std.square().mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
         weights, indices = blends(self.people, t, self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
         y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
+        return y, self.denoiser.likely_coefficients(y, t, condition), t, condition, c
+
+    def error(self, *batch: Tensor) -> Tensor:
+        """Weighted x0 error of a batch."""
+        y, likely, t, condition, c = batch
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        return weighted_error((self.denoiser.coefficients(y, t, condition) - c) / std, std)
+        return weighted_error((self.denoiser.corrected(y, likely, t, condition) - c) / std, std)
 
 
 @dataclasses.dataclass
-class RestObjective:
+class RestObjective(Objective):
     """Loss of the local network: the rest, given the person network's coefficients."""
 
+    name = "local"
     denoiser: PersonDenoiser
     people: LatentSet
     codec: LinearCodec
     vocabulary: AttributeVocabulary
     config: PhaseConfig
 
-    @property
-    def network(self) -> nn.Module:
-        """The network to train."""
-        return _present(self.denoiser.local)
-
-    def loss(self, generator: torch.Generator) -> Tensor:
-        """Weighted x0 error of a random batch at random levels."""
+    @torch.no_grad()
+    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+        """Draw noisy people; return their rest, guessed coefficients, step, condition and clean rest."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
         weights, indices = blends(self.people, t, self.config.blend, generator)
@@ -97,10 +130,13 @@ class RestObjective:
         z[flip] = self.codec.mirror(z[flip])
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
         signal, _ = self.denoiser.schedule.levels(t, z)
-        with torch.no_grad():
-            _, clean = self.denoiser.prior.split(z)
-            y, rest = self.denoiser.prior.split(x, signal)
-            coefficients = self.denoiser.coefficients(y, t, condition)
+        _, clean = self.denoiser.prior.split(z)
+        y, rest = self.denoiser.prior.split(x, signal)
+        return rest, self.denoiser.coefficients(y, t, condition), t, condition, clean
+
+    def error(self, *batch: Tensor) -> Tensor:
+        """Weighted x0 error of a batch."""
+        rest, coefficients, t, condition, clean = batch
         guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
         return weighted_error((guess - clean) / std + correction, std)
 
@@ -123,12 +159,6 @@ def random_steps(
     about = math.log(LEVEL_MEDIAN * spread) + LEVEL_WIDTH * normal
     drawn = torch.where(which < LOG_UNIFORM_SHARE, low + (high - low) * uniform, about.clamp(low, high))
     return torch.searchsorted(noise_over_signal, drawn).clamp_max(schedule.length - 1)
-
-
-def _present(network: nn.Module | None) -> nn.Module:
-    if network is None:
-        raise ValueError("this denoiser was configured without the network that is to be trained: give it a size")
-    return network
 
 
 def blends(

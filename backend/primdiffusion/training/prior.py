@@ -5,6 +5,7 @@ The mixture is fitted by `training/mixture.py`.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -59,7 +60,8 @@ def fit_prior(
     c = torch.cat(coefficients) * kept.sqrt()
     clothes = max(count, len(signs) - 2 * count)  # the others are hands and head; a single part is all
     kinds = fit_mixture(c, clothes, people.condition, vocabulary, config, inside)
-    return PersonPrior(**vars(inside), rest_variance=rest.clamp_min(1e-6), **kinds)
+    components = {field.name: getattr(inside, field.name) for field in dataclasses.fields(inside)}
+    return PersonPrior(**components, rest_variance=rest.clamp_min(1e-6), **kinds)
 
 
 def body_parts() -> Int[Tensor, "k"]:

@@ -66,8 +66,8 @@ class TrainingState:
         self.optimiser.step()
         decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
-            for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(now, 1 - decay)
+            means, now = tuple(self.average.parameters()), tuple(self.network.parameters())
+            torch._foreach_lerp_(means, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
         self.step += 1
         return float(norm)
 

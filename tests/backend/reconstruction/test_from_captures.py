@@ -8,7 +8,6 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.reader import Views
-from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import sample
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
@@ -30,6 +29,7 @@ from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
 from support.errors import refused
+from support.priors import of_whole_body
 from support.tiny import SLOW, TINY, tiny_encoder, tiny_model
 
 MODEL = tiny_model()
@@ -109,7 +109,7 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
     # the mean human is so bright that its colours are clipped: no picture tells which way they should go
     white = torch.zeros_like(PRIOR.mean)
     white[:3] = 150 / 32
-    prior = PersonPrior.of_whole_body(
+    prior = of_whole_body(
         mean=white,
         basis=PRIOR.basis.mT.flatten(1),
         parity=PRIOR.parity,

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed, nn
+from torch.autograd.function import once_differentiable
+
+log = logging.getLogger(__name__)
 
 ENABLED = True
 """Without it everything is launched from Python, by the same kernels and with the same results."""
@@ -91,64 +95,106 @@ def _stream_of_readings(device: torch.device) -> torch.cuda.Stream:
 class Recorded:
     """A function of tensors on one device that is recorded when it is called with the same shapes for the second time.
 
-    The function must be pure, must not wait for the device, and `expect` what it cannot check; if a repetition does not
-    meet that, the call runs the function from Python, which can. Results are overwritten by the next call. Gradients
-    can be taken inside of the function, not through it. On processors this is the function itself.
+    The function must not wait for the device, and `expect` what it cannot check; if a repetition does not meet that,
+    the call runs the function again from Python, which can: such a function must change no tensor. Random numbers of
+    torch's own generator are those of a call from Python. Results are overwritten by the next call. Gradients can be
+    taken inside of the function, not through it. On processors this is the function itself.
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]]) -> None:
         self._function = function
-        self._recordings: dict[tuple, _Recording | None] = {}
-        self._failures: dict[tuple, int] = {}
+        self._recordings: dict[tuple, _Recording] = {}
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Call the function."""
-        key = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
-        if not usable(inputs[0].device) or self._failures.get(key, 0) >= MOST:
+        if not usable(inputs[0].device):
             return self._function(*inputs)
+        key = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
         if key not in self._recordings:
             if len(self._recordings) >= MOST:
                 self._recordings.pop(next(iter(self._recordings)))
-            self._recordings[key] = None
-            return self._function(*inputs)
-        recording = self._recordings[key]
-        if recording is None:
-            recording = self._recordings[key] = _Recording(self._function, inputs)
-        result = recording.replay(inputs)
-        if result is None:
-            self._failures[key] = self._failures.get(key, 0) + 1
-            self._recordings[key] = None
-            return self._function(*inputs)
-        return result
+            self._recordings[key] = _Recording(self._function, inputs)
+        return self._recordings[key](inputs)
 
 
 class _Recording:
-    """The launches of a function for inputs of one shape, copies of which it reads."""
+    """A function for inputs of one shape, which it reads from copies: Triton compiles for how arguments are aligned."""
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor]) -> None:
         with torch.inference_mode(False):
-            self._inputs = [tensor.detach().clone() for tensor in inputs]
-            # Once more for these copies: kernels are compiled for how their arguments are aligned.
-            function(*self._inputs)
-            token = _expected.set([])
-            try:
-                self._graph, (self._result, self._numbers, self._fits) = record(lambda: self._run(function))
-            finally:
-                _expected.reset(token)
+            self._inputs = [torch.empty_like(tensor) for tensor in inputs]
+        self._function, self._failures = function, 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._compiled = False
 
-    def _run(self, function: Callable[..., tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Tensor | None, list[Fits]]:
-        result, expected = function(*self._inputs), _expected.get() or []
+    def __call__(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        with torch.no_grad():
+            copy_all(self._inputs, inputs)
+        if self._compiled and self._failures < MOST:
+            if self._graph is None:
+                self._record()
+            if self._graph is not None and self._repeated(self._graph):
+                return self._result
+            self._graph, self._failures = None, self._failures + 1
+        self._compiled = True
+        return self._function(*self._inputs)
+
+    def _record(self) -> None:
+        token = _expected.set([])
+        try:
+            with torch.inference_mode(False):
+                self._graph, (self._result, self._numbers, self._fits) = record(self._run)
+        except (RuntimeError, MemoryError) as error:
+            log.warning("launched from Python from now on, because it cannot be recorded: %s", error)
+            self._failures = MOST
+        finally:
+            _expected.reset(token)
+
+    def _run(self) -> tuple[tuple[Tensor, ...], Tensor | None, list[Fits]]:
+        result, expected = self._function(*self._inputs), _expected.get() or []
         numbers = torch.stack([numbers for numbers, _ in expected]) if expected else None
         return result, numbers, [fits for _, fits in expected]
 
-    @torch.no_grad()
-    def replay(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...] | None:
-        """Repeat for these inputs; None if that is not what the function expects."""
-        copy_all(self._inputs, inputs)
-        self._graph.replay()
-        if self._numbers is not None:
-            found = Reading(self._numbers).wait()
-            if not all(fits(numbers) for fits, numbers in zip(self._fits, found, strict=True)):
-                return None
+    def _repeated(self, graph: torch.cuda.CUDAGraph) -> bool:
+        """Whether a repetition has met what the function expects."""
+        graph.replay()
         torch.autograd.graph.increment_version(self._result)
-        return self._result
+        found = [] if self._numbers is None else Reading(self._numbers).wait()
+        return all(fits(numbers) for fits, numbers in zip(self._fits, found, strict=True))
+
+
+class RecordedLoss:
+    """A loss of tensors as `Recorded`, together with its gradients in all parameters of a network.
+
+    The result is for one backward pass, before the next call. On processors this is the loss itself, and so it is with
+    several processes, which exchange gradients while the backward pass runs.
+    """
+
+    def __init__(self, loss: Callable[..., Tensor], network: nn.Module) -> None:
+        self._loss, self._parameters = loss, list(network.parameters())
+        self._recorded = Recorded(self._with_gradients)
+
+    def __call__(self, *inputs: Tensor) -> Tensor:
+        """Return the loss."""
+        if not usable(inputs[0].device) or (distributed.is_available() and distributed.is_initialized()):
+            return self._loss(*inputs)
+        loss, *gradients = self._recorded(*inputs)
+        return _Known.apply(loss, gradients, *self._parameters)
+
+    def _with_gradients(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        loss = self._loss(*inputs)
+        return loss.detach(), *torch.autograd.grad(loss, self._parameters)
+
+
+class _Known(torch.autograd.Function):
+    """A number whose gradients in further arguments are known."""
+
+    @staticmethod
+    def forward(ctx: Any, number: Tensor, gradients: list[Tensor], *_: Tensor) -> Tensor:
+        ctx.gradients = gradients
+        return number.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, on_number: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return None, None, *torch._foreach_mul(ctx.gradients, on_number)  # pyright: ignore[reportPrivateImportUsage]
