@@ -20,6 +20,7 @@ FIGURES = (
 )  # fmt: skip
 REHEARSAL = """
 import functools, subprocess, sys
+from dataclasses import replace
 import march_cuda, pytest, torch, train_cuda
 from march_scenes import random_boxes
 from support import graphs
@@ -30,14 +31,17 @@ def clock(call, *_):
 
 patch = pytest.MonkeyPatch()
 graphs.on_processors(patch)
-boxes = random_boxes(2, spread=0.3, smallest=0.02, largest=0.06)
-torch.save({"person": dict(vars(boxes)), "samples": dict.fromkeys((0.004, 0.001), 100)}, "person.pt")
-small, whole = march_cuda.portrait(6), subprocess.run
+boxes = random_boxes(1, spread=0.01, smallest=0.3, largest=0.4, density=4.0)
+torch.save({"person": dict(vars(boxes)), "samples": dict.fromkeys((0.2, 0.05), 100)}, "person.pt")
+small, whole = march_cuda.portrait(4), subprocess.run
 for module, name, value in (
     (torch.cuda, "is_available", lambda asked=[True]: bool(asked) and asked.pop()),  # by the script, not by accelerate
     (torch.cuda, "synchronize", lambda: None),
     (march_cuda, "DEVICE", "cpu"),
     (march_cuda, "portrait", lambda size: small),
+    (march_cuda, "DEFAULT", replace(march_cuda.DEFAULT, step=0.2)),
+    (march_cuda, "FINE", replace(march_cuda.FINE, step=0.05)),
+    (march_cuda, "RELEASED", replace(march_cuda.RELEASED, step=0.2)),
     (march_cuda, "median_ms", clock),
     (march_cuda, "kernels_ms", lambda call: (0.5 * clock(call), "a table")),
     (march_cuda, "operations_per_second", lambda: 1e12),
