@@ -10,9 +10,7 @@ accuracy on renders of held-out meshes. Figures that need an omitted option are 
 
 `python benchmarks/diffusion.py pictures --people DIR --neighbours docs/pictures/neighbours.png` renders humans from
 consecutive seeds, not hand-picked, each beside the nearest human by latents in the folder, with distances (1 is the
-median of the held-out set). `--comparison docs/pictures/generated_comparison.png --checkpoint
-ours/model.safetensors --latents latents/model.safetensors --voxel voxels/voxel.safetensors` renders rows of held-out
-samples, and of the models that benchmarks/tables.py compares.
+median of the held-out set); --more is a second folder of people that it was trained on.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +35,6 @@ from diffusion_sets import (
     stored_voxels,
     voxels,
 )
-from latent_baseline import sample_people
 from march import from_script
 from neighbours import nearest_stored
 from PIL import Image, ImageDraw, ImageFont
@@ -305,27 +301,20 @@ def progress(what: str) -> Callable[[int, int], None]:
 
 
 def pictures() -> None:
-    parser = argparse.ArgumentParser(description="Renders generated humans, neighbours, baselines.")
+    parser = argparse.ArgumentParser(description="Renders generated humans beside their neighbours.")
     parser.add_argument("--people", type=Path, required=True, help="folder of the payloads that were trained on")
     parser.add_argument("--holdout", type=float, default=0.08)
     parser.add_argument("--seed", type=int, default=0, help="of the training run")
     parser.add_argument("--checkpoint", type=Path)
-    parser.add_argument("--latents", type=Path, help="baseline of train_baselines.py")
-    parser.add_argument("--voxel", type=Path, help="baseline of train_baselines.py voxels")
-    parser.add_argument("--count", type=int, default=8, help="people in a picture")
-    parser.add_argument("--neighbours", type=Path, help="PNG of people beside their neighbours")
-    parser.add_argument("--comparison", type=Path, help="PNG of people beside baselines'")
+    parser.add_argument("--count", type=int, default=8, help="people in the picture")
+    parser.add_argument("--more", type=Path, help="another folder of payloads that were trained on")
+    parser.add_argument("--neighbours", type=Path, required=True, help="PNG to write")
     arguments = parser.parse_args()
     model = load_checkpoint(arguments.checkpoint)
     train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
-    if arguments.neighbours is not None:
-        neighbours(model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
-        print(arguments.neighbours)
-    if arguments.comparison is not None:
-        comparison(model, held, arguments.latents, arguments.voxel, arguments.count).save(
-            arguments.comparison, optimize=True
-        )
-        print(arguments.comparison)
+    train += [] if arguments.more is None else find_people(arguments.more)
+    neighbours(model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
+    print(arguments.neighbours, "among", len(train))
 
 
 def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path], count: int) -> Image.Image:
@@ -350,24 +339,6 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
 def stored_one(path: Path, colouring: int) -> Primitives:
     person = read_person(path)
     return Primitives.place(rest_frames(person.betas.numpy()), person.payload(colouring))
-
-
-def comparison(
-    model: DiffusionModel, held: Sequence[Path], latents: Path | None, voxel: Path | None, count: int
-) -> Image.Image:
-    """A row for each way to make people."""
-    seeds = seeds_of(count)
-    some = held[:: max(len(held) // count, 1)][:count]
-    sets: dict[str, Iterable[Primitives]] = {
-        "held out": (stored_one(path, 0) for path in some),
-        "ours": placed(generated(model, seeds)),
-    }
-    if latents is not None:
-        sets["latents"] = placed(iter(sample_people(load_checkpoint(latents), seeds)))
-    if voxel is not None:
-        sets["voxels"] = voxels(load_voxel_model(voxel), seeds)
-    rows = [(name, [(one, "") for one in islice(made, count)]) for name, made in sets.items()]
-    return sheet(rows, "In T pose, from the front, and heads; consecutive seeds, evenly spaced held-out samples")
 
 
 def sheet(rows: Sequence[tuple[str, Sequence[tuple[Primitives, str]]]], heading: str) -> Image.Image:
