@@ -62,7 +62,8 @@ def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | st
     """Figures of the chosen parts on one version of bpy."""
     with tempfile.TemporaryDirectory(prefix="primdiffusion_extension_") as name:
         folder = Path(name)
-        command = [sys.executable, "-m", "primdiffusion", "generate", "--seed", "7", "--out", str(folder / "person")]
+        generate = [sys.executable, "-m", "primdiffusion", "generate", "--seed", "7", "--compact"]
+        command = [*generate, "--out", str(folder / "person")]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         found: dict[str, float | str | None] = {"bpy": version(python)}
         if "register" in arguments.parts:
@@ -106,6 +107,7 @@ def register(_arguments: argparse.Namespace) -> dict[str, float]:
 def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     """One person: objects and file, building, frames with volumes shown, motion; objects that Delete leaves."""
     _enable(arguments)
+    from blender_primdiffusion.jobs.parts import complete_humans
     from blender_primdiffusion.scene.build import build_human
 
     context = bpy.context
@@ -138,6 +140,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     }
     armature.select_set(True)
     bpy.ops.object.delete()
+    complete_humans()  # as a timer does in a window
     return {**figures, "objects_left_after_delete": len(bpy.data.objects)}
 
 

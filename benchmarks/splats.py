@@ -31,7 +31,7 @@ from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
 SIZE, GREY = 512, 0.5
 SAMPLES, QUICK_SAMPLES = 128, 16
 CROWD = (10, 5)
-POSES = 20
+POSES = 100
 SAMPLE = Path(blender_primdiffusion.__file__).parent / "gallery" / "Sample.human"
 
 

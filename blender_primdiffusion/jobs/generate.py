@@ -96,7 +96,8 @@ class GenerateJob(Job):
     def params(self, folder: Path) -> dict[str, Any]:
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         previews = {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
-        return {"seed": self.seed, **self.sampling, **previews, **checkpoint, "out_dir": str(folder)}
+        asked = {"seed": self.seed, **self.sampling, "compact": True}  # it goes into the .blend
+        return {**asked, **previews, **checkpoint, "out_dir": str(folder)}
 
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         notice = build_person(context, result, "Generated")[1]

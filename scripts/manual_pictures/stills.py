@@ -60,7 +60,7 @@ def group(folder: Path) -> list[Path]:
 
 def redressed(folder: Path) -> list[Path]:
     """One person, then in a suit, then in a tee and shorts."""
-    scene = _stage(folder, 0, "Contrapposto")
+    scene = _stage(folder, 10, "Contrapposto")
     pictures, settings = [render(scene, folder / "before.png", SIZE)], scene.primdiffusion_edit
     for number, (parts, outfit) in enumerate((({"clothes"}, "suit"), ({"clothes"}, "tee and shorts"))):
         settings.parts, settings.attributes.outfit = parts, outfit
