@@ -58,7 +58,7 @@ _UNIONS = {
     "head": ("face", "hair", "neck"),
     "arms": ("upper_arms", "forearms"),
     "legs": ("thighs", "shins"),
-    "top": ("torso", "upper_arms", "forearms"),
+    "top": ("torso", "neck", "upper_arms", "forearms"),  # the neck has the collar
     "bottom": ("hips", "thighs", "shins"),
     "shoes": ("feet",),
     "clothes": ("top", "bottom", "shoes"),

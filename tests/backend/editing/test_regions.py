@@ -46,7 +46,7 @@ def test_every_part_has_primitives_and_none_is_everything():
     ("union", "members"),
     [
         ("head", ["face", "hair", "neck"]),
-        ("top", ["torso", "arms"]),
+        ("top", ["torso", "neck", "arms"]),
         ("bottom", ["hips", "legs"]),
         ("shoes", ["feet"]),
         ("clothes", ["top", "bottom", "shoes"]),
