@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
@@ -111,6 +112,8 @@ def renoised(schedule: Schedule, x: Float[Tensor, "b c h w"], t: int, t_up: int,
 MaskedSampler = Callable[
     [Denoise, Schedule, Tensor, Tensor, Tensor, Sequence[int], torch.Generator], Iterator[SamplerStep]
 ]
+DRAWS = 64
+"""Of the person prior, to start from."""
 MASKED_SAMPLERS: Mapping[requests.Masking, MaskedSampler] = {"repaint": repaint, "released": paste_after_steps}
 """Samplers of a region by name."""
 
@@ -129,7 +132,7 @@ def inpaint(
 ) -> Human:
     """Return the human with the primitives of a region resampled to fit the others (`repaint`).
 
-    The region starts from pure noise. Betas, and the payload outside the region, stay bit-identical: those primitives
+    The region starts from noise. Betas, and the payload outside the region, stay bit-identical: those primitives
     are never decoded. `attributes` condition the region; without any the result is unconditional. Costs nearly
     2 * `steps` denoiser calls. Deterministic as `human.generate`. With `masking` "released" the sampler is
     `paste_after_steps`, at `steps` calls.
@@ -151,12 +154,31 @@ def inpaint(
     model = match_density(model, human)
     denoise = conditional_denoiser(model, attributes, guidance)
     known, inside = encoded(model, human), model.cell_mask(region)
-    start = model.start([generator], chain[0], model.condition(attributes))
+    start = start_like(model, known, inside, chain[0], model.condition(attributes), generator)
     sampler = MASKED_SAMPLERS[masking](denoise, model.schedule, start, known, inside, chain, generator)
     x0 = run_sampler(sampler, on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
     edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
     return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
+
+
+def start_like(
+    model: DiffusionModel,
+    known: Float[Tensor, "1 c h w"],
+    inside: Bool[Tensor, "h w"],
+    t: int,
+    condition: Float[Tensor, "a"] | None,
+    generator: torch.Generator,
+) -> Float[Tensor, "1 c h w"]:
+    """The start of a region at step t: of some draws of the person prior the one that is most like the known part.
+
+    What people have in common, such as the tone of their skin, still shows there (`DiffusionModel.start`).
+    """
+    if not isinstance(model.denoiser, PersonDenoiser):
+        return model.start([generator], t, condition)
+    draws = model.denoiser.prior.sample(DRAWS, generator, None if condition is None else condition[None])
+    distance = (draws - known).square().masked_fill(inside, 0).sum((1, 2, 3))
+    return noised(model.schedule, draws[distance.argmin()][None], t, generator)
 
 
 @on_fixed_threads

@@ -3,7 +3,8 @@
 import pytest
 import torch
 from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
-from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint
+from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint, start_like
+from support.tiny import tiny_model
 
 SCHEDULE = linear()
 
@@ -113,3 +114,16 @@ def test_the_more_often_steps_are_sampled_the_better_the_inside_fits_the_outside
     misses = [fits - inside_mean(resamples) for resamples in (1, 2, 5)]
     assert misses[0] > misses[1] > misses[2] > 0
     assert misses[2] < 0.35 * misses[0]
+
+
+def test_a_region_starts_from_a_draw_of_people_that_is_like_the_known_part():
+    """A part alone does not say which skin goes with the rest; the start does."""
+    model = tiny_model()
+    inside = torch.zeros(32, 32, dtype=torch.bool)
+    inside[8:] = True
+    draws = model.denoiser.prior.sample(200, generator(5))
+    for known in draws[:3]:
+        start = start_like(model, known[None], inside, 0, None, generator(1))
+        apart, inner = ((each - known).square().mean(1) for each in (torch.cat([start, draws[3:]]), draws[3:]))
+        assert float(apart[0][~inside].mean()) < float(apart[1:][:, ~inside].mean(1).median()) / 3
+        assert float(apart[0][inside].mean()) < float(inner[:, inside].mean(1).median()) / 3
