@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
 from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint, start_like
 from support.tiny import tiny_model
@@ -119,6 +120,7 @@ def test_the_more_often_steps_are_sampled_the_better_the_inside_fits_the_outside
 def test_a_region_starts_from_a_draw_of_people_that_is_like_the_known_part():
     """A part alone does not say which skin goes with the rest; the start does."""
     model = tiny_model()
+    assert isinstance(model.denoiser, PersonDenoiser)
     inside = torch.zeros(32, 32, dtype=torch.bool)
     inside[8:] = True
     draws = model.denoiser.prior.sample(200, generator(5))
