@@ -73,7 +73,7 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("views that a worker of the loader reads a second", "captures", "loader_views_per_second_512", ""),
         ("a human fitted to its mesh, whole body", "chain", "payload_body_psnr", "dB"),
         ("the same after the codec", "chain", "codec_body_psnr", "dB"),
-        ("cosine of fits to two sets of cameras", "chain", "payload_repeat_cosine", ""),
+        ("cosine of two fits from other cameras, of what components leave out", "chain", "fit_repeat_cosine_rest", ""),
     ),
     "Faithfulness and faults": (
         ("released network, largest difference to the paper's layers by hand", "faithful", "unet_error_max", ""),
