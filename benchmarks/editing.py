@@ -21,9 +21,10 @@ from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.editing.inpaint import harmonise, inpaint, transfer_garment, transfer_texture
+from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import DISJOINT, region_of
+from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, Sampling

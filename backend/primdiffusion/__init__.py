@@ -18,9 +18,10 @@ from primdiffusion.version import __version__
 if TYPE_CHECKING:
     from primdiffusion.body.model import BodyPose, read_pose
     from primdiffusion.diffusion.checkpoint import load_checkpoint
-    from primdiffusion.editing.inpaint import inpaint, transfer_garment, transfer_texture
+    from primdiffusion.editing.inpaint import inpaint
     from primdiffusion.editing.interpolate import interpolate
     from primdiffusion.editing.regions import region_of
+    from primdiffusion.editing.transfer import transfer_garment, transfer_texture
     from primdiffusion.editing.vary import vary
     from primdiffusion.geometry.camera import Camera
     from primdiffusion.human import Human, framing, generate, place
@@ -51,8 +52,8 @@ _MODULES = {
     "interpolate": "editing.interpolate",
     "region_of": "editing.regions",
     "inpaint": "editing.inpaint",
-    "transfer_texture": "editing.inpaint",
-    "transfer_garment": "editing.inpaint",
+    "transfer_texture": "editing.transfer",
+    "transfer_garment": "editing.transfer",
     "person_in_pictures": "reconstruction.from_pictures",
     "reconstruct": "reconstruction.from_captures",
     "save_human": "human_file",

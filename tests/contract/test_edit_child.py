@@ -13,7 +13,7 @@ from primdiffusion.formats.requests import PARTS, SAMPLERS
 from primdiffusion.human_file import load_human, save_human
 from support import tiny
 from support.errors import refused
-from support.tiny import VOCABULARY, anybody
+from support.tiny import VOCABULARY, random_human
 
 from blender_primdiffusion.ui.generate_settings import read_vocabulary
 
@@ -26,7 +26,7 @@ def people(tmp_path_factory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("people")
     paths = {name: str(folder / f"{name}.human.safetensors") for name in ("ann", "bob")}
     for seed, path in enumerate(paths.values(), 1):
-        save_human(path, anybody(seed))
+        save_human(path, random_human(seed))
     return paths
 
 

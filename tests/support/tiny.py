@@ -105,8 +105,8 @@ def save_tiny_encoder(path: Path) -> Path:
 SMALLEST = UNetConfig(width=32, multipliers=(1,) * 5, blocks=1)
 
 
-def anybody(seed: int) -> Human:
-    """Noise for a payload, which no codec holds without loss; betas and delta scales that are nobody's default."""
+def random_human(seed: int) -> Human:
+    """Noise for a payload, which no codec holds without loss; betas and delta scales other than the defaults."""
     generator = torch.Generator().manual_seed(seed)
     payload = Payload(
         torch.rand(K, 3, S, S, S, generator=generator),

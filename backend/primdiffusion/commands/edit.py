@@ -16,9 +16,10 @@ from primdiffusion.commands.progress import ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel, warnings_of
 from primdiffusion.editing.edit import OnStep, combined, with_payload
-from primdiffusion.editing.inpaint import harmonise, inpaint, transfer_garment, transfer_texture
+from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import read_weights, region_from_weights, region_of
+from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import HumanAnswer

@@ -29,7 +29,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from primdiffusion.diffusion.components import Block, PersonComponents, expected, posterior
+from primdiffusion.diffusion.components import PersonComponents
+from primdiffusion.diffusion.kinds import Block, expected, posterior
 
 IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""

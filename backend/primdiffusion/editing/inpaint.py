@@ -1,12 +1,10 @@
-"""Resample a region of a human (RePaint, Lugmayr et al. 2022), or copy it from another human and harmonise it.
+"""Resample a region of a human (RePaint, Lugmayr et al. 2022), or harmonise it with the rest.
 
-The primitives outside the region stay bit-identical. Needs no training. Copies go primitive by primitive:
-all humans share one grid on the body (paper sec. 4).
+The primitives outside the region stay bit-identical. Needs no training.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
@@ -21,7 +19,6 @@ from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, ga
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
 from primdiffusion.editing.edit import (
     OnStep,
-    check_correspondence,
     combined,
     conditional_denoiser,
     decoded,
@@ -35,7 +32,6 @@ from primdiffusion.editing.edit import (
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
-from primdiffusion.primitives.primitives import Payload
 from primdiffusion.runtime.device import on_fixed_threads
 
 RESAMPLES = 2
@@ -216,41 +212,3 @@ def harmonise(
         "steps": steps,
     }
     return with_edit(human, {**edit, **made_by(model)}, payload)
-
-
-def transfer_texture(source: Human, target: Human, region: Bool[Tensor, "k"]) -> Human:
-    """Return the target with the source's colours in a region: the paper's exchange of corresponding primitives.
-
-    Densities, delta scales and betas stay the target's. Suits garments of the same cut, skin, hair colour and patterns.
-    Exact and model-free.
-
-        >>> dressed = pd.transfer_texture(varied, human, region)
-        >>> dressed.payload.rgb[region].equal(varied.payload.rgb[region])
-        True
-
-    Raises ValueError for a region that is empty or not a mask of K, and for different bodies.
-    """
-    payload = dataclasses.replace(target.payload, rgb=source.payload.rgb)
-    return _transferred("transfer_texture", source, target, region, payload)
-
-
-def transfer_garment(source: Human, target: Human, region: Bool[Tensor, "k"]) -> Human:
-    """Return the target with the source's colours, densities and delta scales in a region.
-
-    Suits different cuts, such as a coat over a shirt or long hair, because the silhouette changes too. The target's
-    betas stay. The border of the region may be visible; `harmonise` smooths it.
-
-        >>> dressed = pd.transfer_garment(varied, human, region)
-        >>> dressed.payload.density[region].equal(varied.payload.density[region])
-        True
-
-    Raises as `transfer_texture`.
-    """
-    return _transferred("transfer_garment", source, target, region, source.payload)
-
-
-def _transferred(name: str, source: Human, target: Human, region: Tensor, payload: Payload) -> Human:
-    region = check_region(region)
-    check_correspondence("the source", source.body_setup, "the target", target.body_setup)
-    edit = {"edit": name, "region": name_region(region, target.body_setup), "source": dict(source.provenance)}
-    return with_edit(target, edit, combined(region, payload, target.payload))

@@ -20,7 +20,8 @@ from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.regression import RIDGE, HangingHair, find_hanging_hair, principal_directions, regress_cells
+from primdiffusion.training.hanging_hair import HangingHair, find_hanging_hair
+from primdiffusion.training.regression import RIDGE, principal_directions, regress_cells
 
 PASSES = 4
 """Rounds of backfitting."""

@@ -7,7 +7,7 @@ import pytest
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.human_file import load_human, save_human
-from support.tiny import anybody, save_tiny_checkpoint, tiny_model
+from support.tiny import random_human, save_tiny_checkpoint, tiny_model
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 
@@ -17,7 +17,7 @@ def folder(tmp_path_factory):
     """Two people, a checkpoint and a painted region."""
     folder = tmp_path_factory.mktemp("people")
     for seed, name in ((1, "ann"), (2, "bob")):
-        save_human(folder / f"{name}.human.safetensors", anybody(seed))
+        save_human(folder / f"{name}.human.safetensors", random_human(seed))
     save_tiny_checkpoint(folder / "tiny.safetensors")
     weights = (default_body().template[:, 1] > 0.2).float()
     np.savez(folder / "painted.npz", weights=weights)

@@ -10,15 +10,16 @@ from diffusion_people import small_model
 from primdiffusion.diffusion.model import seeded
 from primdiffusion.diffusion.schedule import dense_steps, early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
-from primdiffusion.editing.inpaint import harmonise, inpaint, transfer_garment, transfer_texture
+from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate, inversion_steps, inverted, slerp
 from primdiffusion.editing.regions import region_of
+from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from support.errors import refused
-from support.tiny import anybody, slab_model, tiny_model
+from support.tiny import random_human, slab_model, tiny_model
 
 FIELDS = ("rgb", "density", "delta_scale")
 TOP = region_of(["top"])
@@ -32,12 +33,12 @@ def model(request):
 
 @pytest.fixture(scope="module")
 def human():
-    return anybody(1)
+    return random_human(1)
 
 
 @pytest.fixture(scope="module")
 def other():
-    return anybody(2)
+    return random_human(2)
 
 
 def same(one, two, where=slice(None)) -> bool:
