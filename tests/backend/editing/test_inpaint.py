@@ -125,7 +125,7 @@ def test_a_region_starts_from_a_draw_of_people_that_is_like_the_known_part():
     inside[8:] = True
     draws = model.denoiser.prior.sample(200, generator(5))
     for known in draws[:3]:
-        start = start_like(model, known[None], inside, 0, None, generator(1))
+        start = start_like(model, known.masked_fill(inside, 9.0)[None], inside, 0, None, generator(1))
         apart, inner = ((each - known).square().mean(1) for each in (torch.cat([start, draws[3:]]), draws[3:]))
         assert float(apart[0][~inside].mean()) < float(apart[1:][:, ~inside].mean(1).median()) / 3
         assert float(apart[0][inside].mean()) < float(inner[:, inside].mean(1).median()) / 3
