@@ -111,6 +111,11 @@ class PersonPrior(PersonComponents):
         shares[:, real] = torch.cat(found)
         return shares.unflatten(1, self.log_weight.shape)
 
+    def expected_kind(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b x"]:
+        """Probability of each attribute's value given clean person coefficients, laid out as conditions."""
+        shares = self.kind_shares(c).flatten(1)
+        return (shares @ self.kind.to(shares).flatten(0, 1)).to(c)
+
     @functools.cached_property
     def _real_kinds(self) -> tuple[Int[Tensor, "n"], tuple[Block, Block]]:
         """Places of kinds that are not padding, with their clothes and heads."""

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from primdiffusion.body.model import LARGEST_BETA
-from primdiffusion.diffusion.codec import VALUES, CellCodec, Codec, LinearCodec
+from primdiffusion.diffusion.codec import VALUES, CellCodec, Codec, LinearCodec, payload_from_cells
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.hair import BRIGHTEST, HairStyles
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule, trailing_steps
 from primdiffusion.formats import requests
@@ -72,6 +73,8 @@ class DiffusionModel:
     """Descending t that a sampler visits, from the schedule's length and the number of steps."""
     body_setup: BodySetup | None = None
     """Body and anchors of the humans it generates; None is the default body."""
+    hair: HairStyles | None = None
+    """Styles whose hair `decode` gives one colour; for a person prior with attributes."""
 
     @property
     def device(self) -> torch.device:
@@ -86,7 +89,10 @@ class DiffusionModel:
     def to(self, device: torch.device | str) -> DiffusionModel:
         """The same model on another device; moves the networks in place."""
         codec = self.codec.to(device) if isinstance(self.codec, CellCodec) else self.codec
-        return dataclasses.replace(self, denoiser=self.denoiser.to(device), codec=codec, shapes=self.shapes.to(device))
+        hair = None if self.hair is None else self.hair.to(device)
+        return dataclasses.replace(
+            self, denoiser=self.denoiser.to(device), codec=codec, shapes=self.shapes.to(device), hair=hair
+        )
 
     def condition(self, attributes: Attributes) -> Float[Tensor, "a"] | None:
         """Encode attributes for the denoiser; None without attributes.
@@ -151,8 +157,17 @@ class DiffusionModel:
         return x
 
     def decode(self, x0: Float[Tensor, "*b c h w"]) -> Payload:
-        """The payload of clean samples: colours linear in [0, 1], densities 1/m >= 0, ordinary tensors."""
-        return self.codec.to_payload(x0, self.full_density)
+        """The payload of clean samples: colours linear in [0, 1], densities 1/m >= 0, ordinary tensors.
+
+        Hair of a known style has one colour (`HairStyles`).
+        """
+        prior = getattr(self.denoiser, "prior", None)
+        if self.hair is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):
+            return self.codec.to_payload(x0, self.full_density)
+        codec, samples = self.codec.codec, x0.reshape(-1, *self.codec.shape)
+        style = self.hair.of_people(prior.expected_kind(prior.split(samples)[0]))
+        cells = self.hair.recolour(codec.decode(samples), style).view(*x0.shape[:-3], K, VALUES)
+        return payload_from_cells(cells, self.full_density, codec.zone)
 
     def encode(self, payload: Payload) -> Float[Tensor, "*b c h w"]:
         """The clean samples nearest to payloads, on the model's device."""
@@ -260,6 +275,18 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
         raise ValueError(f"parts are described by {prior.kind.shape[-1]} values, attributes by {vocabulary.width}")
 
 
+def check_hair(hair: HairStyles, vocabulary: AttributeVocabulary) -> None:
+    """Raise ValueError unless styles of hair are of primitives and of people with this vocabulary."""
+    check_shapes(hair)
+    if hair.condition.shape[1] != vocabulary.width:
+        raise ValueError(f"styles of hair are described by {hair.condition.shape[1]} values, not {vocabulary.width}")
+    if bool((hair.cells < 0).any()) or bool((hair.cells >= K).any()):
+        raise ValueError(f"styles of hair are in boxes that are not from 0 to {K - 1}")
+    for name, values, largest in (("shares", hair.share, 1.0), ("tones", hair.tone, BRIGHTEST)):
+        if bool((values < 0).any()) or bool((values > largest).any()):
+            raise ValueError(f"{name} of hair are not from 0 to {largest:g}")
+
+
 def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
     variances = ("rest_variance", "variance", "left", "head_variance", "head_left")
     for name, values in [*((name, getattr(prior, name)) for name in variances), ("limit", shapes.limit)]:
@@ -287,8 +314,7 @@ def unfollowed(model: DiffusionModel, x0: Float[Tensor, "b c h w"], attributes: 
         return [{} for _ in x0]
     blocks = model.vocabulary.blocks()
     found = []
-    shares = prior.kind_shares(prior.split(x0)[0]).flatten(1)
-    for probability in (shares @ prior.kind.to(shares).flatten(0, 1)).cpu():
+    for probability in prior.expected_kind(prior.split(x0)[0]).cpu():
         shown = {name: probability[blocks[name]].max(0) for name in asked}
         values = {name: categories[name][int(best.indices)] for name, best in shown.items() if best.values > CERTAIN}
         found.append({name: value for name, value in values.items() if value != asked[name]})
