@@ -7,6 +7,7 @@ import torch
 from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.hair import BRIGHTEST, HairStyles, voxels_of
 from primdiffusion.diffusion.model import check_hair
 from primdiffusion.editing.regions import region_of
@@ -139,6 +140,7 @@ def styled_model():
 
 def test_decoding_recolours_people_who_show_the_style():
     model = styled_model()
+    assert isinstance(model.denoiser, PersonDenoiser)
     prior = model.denoiser.prior
     woman, man = (prior.join(c[None], torch.zeros(1, *model.codec.shape)) for c in prior.centre[0])
     plain = dataclasses.replace(model, hair=None)
@@ -156,12 +158,13 @@ def test_decoding_recolours_people_who_show_the_style():
 def test_styles_are_stored_in_bytes(tmp_path):
     model = styled_model()
     save_checkpoint(tmp_path / "model.safetensors", model, "linear")
-    loaded = load_checkpoint(tmp_path / "model.safetensors").hair
+    loaded, hair = load_checkpoint(tmp_path / "model.safetensors").hair, model.hair
     assert loaded is not None
-    torch.testing.assert_close(loaded.share, model.hair.share, atol=0.5 / 255 + 1e-6, rtol=0)
-    torch.testing.assert_close(loaded.tone, model.hair.tone, atol=0.5 * BRIGHTEST / 255 + 1e-6, rtol=0)
+    assert hair is not None
+    torch.testing.assert_close(loaded.share, hair.share, atol=0.5 / 255 + 1e-6, rtol=0)
+    torch.testing.assert_close(loaded.tone, hair.tone, atol=0.5 * BRIGHTEST / 255 + 1e-6, rtol=0)
     for name in ("condition", "cells", "head"):
-        assert torch.equal(getattr(loaded, name), getattr(model.hair, name))
+        assert torch.equal(getattr(loaded, name), getattr(hair, name))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +177,8 @@ def test_styles_are_stored_in_bytes(tmp_path):
         {"tone": torch.full((1, 5, S**3), -0.5)},
     ],
 )
-def test_styles_that_do_not_fit_are_refused(tmp_path, damage):
+def test_styles_that_do_not_fit_are_refused(damage):
     model = styled_model()
+    assert model.hair is not None
     with refused(ValueError):
         check_hair(dataclasses.replace(model.hair, **damage), model.vocabulary)
