@@ -5,7 +5,7 @@
 
 People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
 for the closed form alone. The network over person components goes: its components are others now. The local network
-keeps its weights for what has not changed. With `--hair-only` everything stays but the styles of hair.
+keeps its weights for what has not changed. With `--surfaces-only` everything stays but the surfaces of one colour.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.hair_styles import fit_hair_styles
 from primdiffusion.training.latents import LatentSet, encode_people, split_people, vocabulary_of
 from primdiffusion.training.prior import fit_prior, fit_shapes
+from primdiffusion.training.surfaces import fit_surfaces
 from torch import Tensor
 
 
@@ -34,7 +34,9 @@ def main() -> None:
     parser.add_argument("--people", type=Path, required=True, help="folder of `primdiffusion payloads`")
     parser.add_argument("--more", type=Path, help="further people, of an earlier wardrobe")
     parser.add_argument("--without", nargs="*", default=["suit"], help="outfits of --more that are left out")
-    parser.add_argument("--hair-only", action="store_true", help="find the styles of hair and keep all else")
+    parser.add_argument(
+        "--surfaces-only", action="store_true", help="find the surfaces of one colour and keep all else"
+    )
     parser.add_argument("--channels", type=int, default=96, help="leading latent channels of person components")
     parser.add_argument("--axes", type=int, default=64, help="principal axes of a covariance")
     parser.add_argument("--holdout", type=float, default=0.05, help="share of --people left out, as by training")
@@ -45,7 +47,7 @@ def main() -> None:
     assert isinstance(base.codec, CellCodec)
     codec, people = base.codec.codec, PersonFolder(arguments.people)
     vocabulary = base.vocabulary
-    if not arguments.hair_only:
+    if not arguments.surfaces_only:
         vocabulary = vocabulary_of(known for index in range(len(people.names)) for known in people.known(index))
     fitted, _ = split_people(range(len(people.names)), arguments.holdout, arguments.seed)
     latents = encode_people(people, fitted, codec, vocabulary)
@@ -59,9 +61,9 @@ def main() -> None:
         ]
         latents = joined(latents, others, torch.tensor(used))
     config = PriorConfig(channels=arguments.channels, axes=arguments.axes)
-    hair = fit_hair_styles(latents, codec, vocabulary, config)
-    if arguments.hair_only:
-        save_checkpoint(arguments.out, dataclasses.replace(base, hair=hair), str(base.card["schedule"]))
+    surfaces = fit_surfaces(latents, codec, vocabulary, config)
+    if arguments.surfaces_only:
+        save_checkpoint(arguments.out, dataclasses.replace(base, surfaces=surfaces), str(base.card["schedule"]))
         return
     prior = fit_prior(latents, codec, vocabulary, config)
     shapes = fit_shapes(latents, prior)
@@ -69,7 +71,7 @@ def main() -> None:
     denoiser = with_prior(base.denoiser, prior)
     card = {**base.card, "closed_form_geometries": len(latents.betas), "closed_form_people": len(latents)}
     model = DiffusionModel(
-        denoiser, base.schedule, base.codec, shapes, base.full_density, card, vocabulary, base.chain, hair=hair
+        denoiser, base.schedule, base.codec, shapes, base.full_density, card, vocabulary, base.chain, surfaces=surfaces
     )  # fmt: skip
     save_checkpoint(arguments.out, model, str(base.card["schedule"]))
     print(arguments.out, len(latents.betas), "geometries,", len(latents), "colourings")

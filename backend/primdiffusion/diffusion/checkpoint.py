@@ -21,17 +21,17 @@ from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, 
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.hair import BRIGHTEST, HairStyles
 from primdiffusion.diffusion.model import (
     BETAS,
     STANDARD_SHAPES,
     DiffusionModel,
     ShapePrior,
     check_codec,
-    check_hair,
     check_parts,
+    check_surfaces,
 )
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.diffusion.surfaces import BRIGHTEST, Surfaces
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.files import tensor_file
 from primdiffusion.files.arrays import LARGEST_NUMBER
@@ -139,8 +139,8 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         tensors |= _fields("codec", codec)
         store_prior(tensors, codec)
         tensors |= _fields("shapes", model.shapes)
-        if model.hair is not None:
-            tensors |= store_hair(_fields("hair", model.hair))
+        if model.surfaces is not None:
+            tensors |= store_surfaces(_fields("surfaces", model.surfaces))
         architecture |= {"kind": "person"}
     else:
         architecture |= {"kind": "slab"}
@@ -236,7 +236,7 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
     vocabulary = AttributeVocabulary.from_json(config.vocabulary)
     if config.kind == "slab":
         denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(config.unet()), weights)
-        codec, shapes, hair = WholeSlab(), STANDARD_SHAPES, None
+        codec, shapes, surfaces = WholeSlab(), STANDARD_SHAPES, None
     else:
         stored = under(tensors, "codec.")
         codec = CellCodec(LinearCodec(**{**stored, "region": stored["region"].long()}))
@@ -245,12 +245,12 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
         prior = PersonPrior(**under(weights, "prior_"))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
-        hair = restore_hair(under(tensors, "hair."), vocabulary)
+        surfaces = restore_surfaces(under(tensors, "surfaces."), vocabulary)
         denoiser = tensor_file.load_network(lambda: PersonDenoiser(config.denoiser(), prior, schedule), weights)
     denoiser.eval().requires_grad_(False)
     chain = CHAINS[config.chain]
     density = float(config.full_density)
-    return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain, hair=hair)
+    return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain, surfaces=surfaces)
 
 
 def _released_model(
@@ -357,24 +357,25 @@ def _is_halved(key: str, value: Tensor) -> bool:
 
 
 BYTE = 255.0
-"""A stored share of hair of 1, or the largest tone."""
+"""A stored share of 1, or the largest tone."""
 
 
-def store_hair(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Styles of hair with shares and tones in bytes."""
-    in_bytes = {"hair.share": tensors["hair.share"], "hair.tone": tensors["hair.tone"] / BRIGHTEST}
+def store_surfaces(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Surfaces with shares and tones in bytes."""
+    in_bytes = {"surfaces.share": tensors["surfaces.share"], "surfaces.tone": tensors["surfaces.tone"] / BRIGHTEST}
     return tensors | {key: (value * BYTE).round().to(torch.uint8) for key, value in in_bytes.items()}
 
 
-def restore_hair(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabulary) -> HairStyles | None:
-    """Undo `store_hair`; None without styles. Raises ValueError, KeyError and TypeError for tensors that do not fit."""
+def restore_surfaces(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabulary) -> Surfaces | None:
+    """Undo `store_surfaces`; None without any. Raises ValueError, KeyError and TypeError where tensors do not fit."""
     if not tensors:
         return None
-    tensors = {**tensors, "cells": tensors["cells"].long(), "head": tensors["head"].bool()}
-    tensors |= {"share": tensors["share"].float() / BYTE, "tone": tensors["tone"].float() / BYTE * BRIGHTEST}
-    hair = HairStyles(**tensors)
-    check_hair(hair, vocabulary)
-    return hair
+    whole = {name: tensors[name].long() for name in ("surface", "cell")}
+    flags = {name: tensors[name].bool() for name in ("read", "drawn")}
+    of_voxels = {"share": tensors["share"].float() / BYTE, "tone": tensors["tone"].float() / BYTE * BRIGHTEST}
+    surfaces = Surfaces(**{**tensors, **whole, **flags, **of_voxels})
+    check_surfaces(surfaces, vocabulary)
+    return surfaces
 
 
 SYMMETRIC = 1e-4

@@ -15,9 +15,9 @@ from primdiffusion.diffusion.codec import VALUES, CellCodec, Codec, LinearCodec,
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.hair import BRIGHTEST, HairStyles
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule, trailing_steps
+from primdiffusion.diffusion.surfaces import BRIGHTEST, Surfaces
 from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord, check_shapes
 from primdiffusion.primitives.body_setup import BodySetup
@@ -73,8 +73,8 @@ class DiffusionModel:
     """Descending t that a sampler visits, from the schedule's length and the number of steps."""
     body_setup: BodySetup | None = None
     """Body and anchors of the humans it generates; None is the default body."""
-    hair: HairStyles | None = None
-    """Styles whose hair `decode` gives one colour; for a person prior with attributes."""
+    surfaces: Surfaces | None = None
+    """Hair, garments and skin that `decode` gives one colour each; for a person prior with attributes."""
 
     @property
     def device(self) -> torch.device:
@@ -89,9 +89,9 @@ class DiffusionModel:
     def to(self, device: torch.device | str) -> DiffusionModel:
         """The same model on another device; moves the networks in place."""
         codec = self.codec.to(device) if isinstance(self.codec, CellCodec) else self.codec
-        hair = None if self.hair is None else self.hair.to(device)
+        surfaces = None if self.surfaces is None else self.surfaces.to(device)
         return dataclasses.replace(
-            self, denoiser=self.denoiser.to(device), codec=codec, shapes=self.shapes.to(device), hair=hair
+            self, denoiser=self.denoiser.to(device), codec=codec, shapes=self.shapes.to(device), surfaces=surfaces
         )
 
     def condition(self, attributes: Attributes) -> Float[Tensor, "a"] | None:
@@ -159,14 +159,14 @@ class DiffusionModel:
     def decode(self, x0: Float[Tensor, "*b c h w"]) -> Payload:
         """The payload of clean samples: colours linear in [0, 1], densities 1/m >= 0, ordinary tensors.
 
-        Hair of a known style has one colour (`HairStyles`).
+        Hair, plain garments and skin have one colour each (`Surfaces`).
         """
         prior = getattr(self.denoiser, "prior", None)
-        if self.hair is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):
+        if self.surfaces is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):
             return self.codec.to_payload(x0, self.full_density)
         codec, samples = self.codec.codec, x0.reshape(-1, *self.codec.shape)
-        style = self.hair.of_people(prior.expected_kind(prior.split(samples)[0]))
-        cells = self.hair.recolour(codec.decode(samples), style).view(*x0.shape[:-3], K, VALUES)
+        kind = prior.expected_kind(prior.split(samples)[0])
+        cells = self.surfaces.recolour(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
         return payload_from_cells(cells, self.full_density, codec.zone)
 
     def encode(self, payload: Payload) -> Float[Tensor, "*b c h w"]:
@@ -275,16 +275,18 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
         raise ValueError(f"parts are described by {prior.kind.shape[-1]} values, attributes by {vocabulary.width}")
 
 
-def check_hair(hair: HairStyles, vocabulary: AttributeVocabulary) -> None:
-    """Raise ValueError unless styles of hair are of primitives and of people with this vocabulary."""
-    check_shapes(hair)
-    if hair.condition.shape[1] != vocabulary.width:
-        raise ValueError(f"styles of hair are described by {hair.condition.shape[1]} values, not {vocabulary.width}")
-    if bool((hair.cells < 0).any()) or bool((hair.cells >= K).any()):
-        raise ValueError(f"styles of hair are in boxes that are not from 0 to {K - 1}")
-    for name, values, largest in (("shares", hair.share, 1.0), ("tones", hair.tone, BRIGHTEST)):
+def check_surfaces(surfaces: Surfaces, vocabulary: AttributeVocabulary) -> None:
+    """Raise ValueError unless surfaces are of primitives and of people with this vocabulary."""
+    check_shapes(surfaces)
+    if surfaces.condition.shape[1] != vocabulary.width:
+        raise ValueError(f"surfaces are described by {surfaces.condition.shape[1]} values, not {vocabulary.width}")
+    limits = (("surface", surfaces.surface, len(surfaces.condition)), ("cell", surfaces.cell, K))
+    for name, numbers, count in limits:
+        if bool((numbers < 0).any()) or bool((numbers >= count).any()):
+            raise ValueError(f"{name} has numbers that are not from 0 to {count - 1}")
+    for name, values, largest in (("share", surfaces.share, 1.0), ("tone", surfaces.tone, BRIGHTEST)):
         if bool((values < 0).any()) or bool((values > largest).any()):
-            raise ValueError(f"{name} of hair are not from 0 to {largest:g}")
+            raise ValueError(f"{name} has values that are not from 0 to {largest:g}")
 
 
 def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:

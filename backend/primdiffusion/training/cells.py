@@ -15,9 +15,9 @@ from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.hair import HairStyles
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.diffusion.surfaces import Surfaces
 from primdiffusion.files import tensor_file
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
@@ -26,11 +26,11 @@ from primdiffusion.people.stored_people import PersonFolder, one_density
 from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
-from primdiffusion.training.hair_styles import fit_hair_styles
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
+from primdiffusion.training.surfaces import fit_surfaces
 
 PREPARED = "prepared.safetensors"
 
@@ -44,7 +44,7 @@ class Prepared:
     codec: LinearCodec
     prior: PersonPrior
     shapes: ShapePrior
-    hair: HairStyles | None
+    surfaces: Surfaces | None
     vocabulary: AttributeVocabulary
     full_density: float
 
@@ -57,7 +57,7 @@ def prepare(
     base: DiffusionModel | None = None,
     more: PersonFolder | None = None,
 ) -> Prepared:
-    """Return codec, latents, prior, shapes and styles of hair of a run; loaded from its folder if they are saved there.
+    """Return codec, latents, prior, shapes and surfaces of a run; loaded from the run folder if they are saved there.
 
     With a `base` (`load_base`) all but the latents are those of that model. `more` are blurred people to train on.
 
@@ -82,8 +82,8 @@ def prepare(
     latents, unseen = _encoded(people, train, held, more, codec, vocabulary)
     prior = fit_prior(latents, codec, vocabulary, config.prior)
     shapes = fit_shapes(latents, prior)
-    hair = fit_hair_styles(latents, codec, vocabulary, config.prior)
-    prepared = Prepared(latents, unseen, codec, prior, shapes, hair, vocabulary, people.full_density)
+    surfaces = fit_surfaces(latents, codec, vocabulary, config.prior)
+    prepared = Prepared(latents, unseen, codec, prior, shapes, surfaces, vocabulary, people.full_density)
     _save_prepared(path, prepared)
     return prepared
 
@@ -136,7 +136,7 @@ def _prepared_with(
     codec, vocabulary = base.codec.codec, base.vocabulary
     latents, unseen = _encoded(people, train, held, more, codec, vocabulary)
     return Prepared(
-        latents, unseen, codec, base.denoiser.prior, base.shapes, base.hair, vocabulary, people.full_density
+        latents, unseen, codec, base.denoiser.prior, base.shapes, base.surfaces, vocabulary, people.full_density
     )
 
 
@@ -152,7 +152,7 @@ class CellTask(DiffusionTask):
         torch.manual_seed(config.seed)
         self.config, self.device = config, device
         self.codec, self.shapes = prepared.codec.to(device), prepared.shapes.to(device)
-        self.hair = None if prepared.hair is None else prepared.hair.to(device)
+        self.surfaces = None if prepared.surfaces is None else prepared.surfaces.to(device)
         self.train, self.held = prepared.train.to(device), prepared.held.to(device)
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
         schedule = SCHEDULES[str(config.schedule)]()
@@ -213,7 +213,7 @@ class CellTask(DiffusionTask):
         codec, denoiser = CellCodec(self.codec), self.denoiser
         return DiffusionModel(
             denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary,
-            CHAINS[str(self.config.chain)], hair=self.hair,
+            CHAINS[str(self.config.chain)], surfaces=self.surfaces,
         )  # fmt: skip
 
     def _objective(self, phase: str) -> PersonObjective | RestObjective:
@@ -229,7 +229,7 @@ class CellTask(DiffusionTask):
 
 def _save_prepared(path: Path, prepared: Prepared) -> None:
     tensors = {}
-    for name in ("train", "held", "codec", "prior", "shapes", "hair"):
+    for name in ("train", "held", "codec", "prior", "shapes", "surfaces"):
         record = getattr(prepared, name)
         for field in () if record is None else dataclasses.fields(record):
             value = getattr(record, field.name)
@@ -251,7 +251,7 @@ def _load_prepared(path: Path) -> Prepared:
             LinearCodec(**part("codec")),
             PersonPrior(**part("prior")),
             ShapePrior(**part("shapes")),
-            HairStyles(**part("hair")) if part("hair") else None,
+            Surfaces(**part("surfaces")) if part("surfaces") else None,
             AttributeVocabulary.from_json(parse_json(about["vocabulary"])),
             float(about["full_density"]),
         )

@@ -1,0 +1,248 @@
+"""Surfaces of one colour: found in people whose colours are known, drawn in one colour, stored in bytes."""
+
+import dataclasses
+
+import pytest
+import torch
+from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
+from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.model import check_surfaces
+from primdiffusion.diffusion.surfaces import BRIGHTEST, Surfaces, voxels_of
+from primdiffusion.editing.regions import region_of
+from primdiffusion.primitives.primitives import K, S
+from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.latents import LatentSet
+from primdiffusion.training.surfaces import fit_surfaces
+from support.errors import refused
+from support.tiny import model_of_two_kinds
+
+WORDS = AttributeVocabulary(
+    {
+        "outfit": ("jumper", "tee"),
+        "pattern": ("patterned", "plain"),
+        "hair": ("bald", "long", "short"),
+        "hat": ("cap", "none"),
+    },
+    {},
+)
+GEOMETRIES, COLOURINGS = 6, 6
+INNER, OUTER = slice(0, S**3 // 2), slice(S**3 // 2, S**3)
+"""Halves of a box, near the body and away from it."""
+FAR_IN, FAR_OUT = slice(0, S**3 // 2 - S**2), slice(S**3 // 2 + S**2, S**3)
+"""Without the layers next to the other half, which smoothing reaches."""
+HANGING, CUFF = 0.6, 0.8
+"""Tones of hair that hangs, and of a tee's lower part."""
+TOP, CUFFS, BARE = ("torso", "upper_arms"), ("upper_arms",), ("forearms", "hands", "shins", "face")
+
+
+@pytest.fixture(scope="module")
+def codec():
+    """Without loss for boxes whose halves have one colour and density each."""
+    basis = torch.zeros(2, 4, 4, S**3)
+    for half, voxels in enumerate((INNER, OUTER)):
+        basis[half, torch.arange(4), torch.arange(4), voxels] = (S**3 / 2) ** -0.5
+    basis = torch.nn.functional.pad(basis.flatten(2).flatten(0, 1), (0, 3))
+    mean = torch.nn.functional.pad(torch.zeros(K, VALUES - 3), (0, 3), value=SCALE_VALUE)
+    return LinearCodec(mean, basis[None], torch.ones(1, 8), torch.zeros(K, dtype=torch.int64))
+
+
+def below_hair():
+    """Boxes of the torso over which long hair hangs."""
+    return region_of(("torso",)).nonzero()[::4, 0]
+
+
+def dressed(hair, colours, generator=None):
+    """Cells of a person in a tee; with a generator it is patterned: each box has a colour of its own."""
+    voxels = torch.zeros(K, S**3, 4)
+    voxels[..., 3] = 1.0
+    voxels[..., :3] = colours["skin"]
+    voxels[region_of(("hips", "thighs", "feet")), :, :3] = colours["trousers"]
+    voxels[region_of(TOP), :, :3] = colours["tee"]
+    voxels[region_of(CUFFS), :, :3] *= CUFF
+    if generator is not None:
+        voxels[region_of(TOP), :, :3] = torch.rand(int(region_of(TOP).sum()), 1, 3, generator=generator)
+    if hair != "bald":
+        voxels[region_of(("hair",)), OUTER, :3] = colours["hair"]
+    if hair == "long":
+        voxels[below_hair(), OUTER, :3] = HANGING * colours["hair"]
+    return torch.nn.functional.pad(voxels.mT.flatten(1), (0, 3), value=SCALE_VALUE)
+
+
+def some_colours(generator):
+    """Dark hair goes with dark skin."""
+    drawn = {name: 0.15 + 0.7 * torch.rand(3, generator=generator) for name in ("hair", "tee", "trousers", "skin")}
+    return drawn | {"skin": 0.75 * drawn["skin"] + 0.25 * drawn["hair"]}
+
+
+@pytest.fixture(scope="module")
+def people(codec):
+    generator = torch.Generator().manual_seed(1)
+    cells, conditions = [], []
+    names = [hair for hair in ("long", "short", "bald") for _ in range(GEOMETRIES)]
+    for geometry, hair in enumerate(names):
+        for number in range(COLOURINGS):
+            patterned = number == 0
+            cells.append(dressed(hair, some_colours(generator), generator if patterned else None))
+            known = {"outfit": "tee", "pattern": "patterned" if patterned else "plain"}
+            conditions.append(WORDS.encode({**known, "hair": hair, "hat": "cap" if geometry == 0 else "none"}))
+    geometry = torch.arange(len(names)).repeat_interleave(COLOURINGS)
+    latents = codec.encode(torch.stack(cells)).half()
+    return LatentSet(
+        latents, geometry, torch.zeros(len(names), 10), torch.stack(conditions), torch.tensor(len(latents))
+    )
+
+
+@pytest.fixture(scope="module")
+def surfaces(people, codec):
+    return fit_surfaces(people, codec, WORDS, PriorConfig())
+
+
+def rows_of(surfaces, **known):
+    """The rows of the surface of exactly these people, in their boxes' order."""
+    found = (surfaces.condition == WORDS.encode(known)).all(1).nonzero()[:, 0]
+    return [
+        surfaces.map(
+            lambda values, one=one: values[surfaces.surface == one] if len(values) == len(surfaces.cell) else values
+        )
+        for one in found
+    ]
+
+
+def over(values, cells):
+    """Values of rows by their boxes; 0 in others."""
+    return torch.zeros(K, *values.shape[1:], dtype=values.dtype).index_copy(0, cells, values)
+
+
+def test_hair_is_found_where_people_of_a_style_have_it(surfaces):
+    (long,), (short,) = (rows_of(surfaces, hair=hair, hat="none") for hair in ("long", "short"))
+    for style in (long, short):
+        share = over(style.share, style.cell)[region_of(("hair",))]
+        assert float(share[:, FAR_OUT].min()) > 0.9
+        assert float(share[:, FAR_IN].max()) < 0.1
+    share, tone = (over(each, long.cell)[below_hair()] for each in (long.share, long.tone))
+    assert float(share[:, FAR_OUT].min()) > 0.9
+    assert float(share[:, FAR_IN].max()) < 0.1
+    torch.testing.assert_close(tone[:, FAR_OUT], torch.full_like(tone[:, FAR_OUT], HANGING), atol=0.03, rtol=0)
+    bare = region_of(("torso",)).index_fill(0, below_hair(), False)
+    assert not over(long.share, long.cell)[bare].any()
+    assert not over(short.share, short.cell)[region_of(("torso", "legs", "hands"))].any()
+    assert not rows_of(surfaces, hair="bald", hat="none")  # whose scalp has the colour of the hands
+
+
+def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
+    garments, (skin,) = rows_of(surfaces, outfit="tee", pattern="plain"), rows_of(surfaces, outfit="tee")
+    tee = next(each for each in garments if region_of(("torso",))[each.cell].any())
+    assert torch.equal(over(torch.ones_like(tee.cell), tee.cell) > 0, region_of(TOP))
+    tone = over(tee.tone, tee.cell)
+    ratio = float(tone[region_of(CUFFS)].mean() / tone[region_of(("torso",))].mean())
+    assert ratio == pytest.approx(CUFF, abs=0.02)
+    assert region_of(BARE)[skin.cell].sum() == region_of(BARE).sum()
+    assert not region_of((*TOP, "hips", "feet", "hair"))[skin.cell].any()
+    assert torch.equal(skin.read, region_of(("face",))[skin.cell])
+    assert torch.equal(skin.drawn, ~skin.read)
+
+
+def test_what_took_other_colours_gets_its_own_back(surfaces):
+    generator = torch.Generator().manual_seed(7)
+    colours = some_colours(generator)
+    right = dressed("long", colours)
+    wrong = voxels_of(right).clone()
+    below, forearms = below_hair(), region_of(("forearms",))
+    wrong[below, OUTER, :3] = (wrong[below, OUTER, :3] + colours["tee"]) / 2  # hair of the shirt's colour
+    blotches = region_of(("torso",)).nonzero()[1::4, 0]
+    wrong[blotches, :, :3] *= 0.7
+    wrong[forearms, :, :3] *= 0.8  # arms that are darker than the face
+    wrong = torch.nn.functional.pad(wrong.mT.flatten(1), (0, 3), value=SCALE_VALUE)
+    kind = WORDS.encode({"outfit": "tee", "pattern": "plain", "hair": "long", "hat": "none"})[None]
+    mended = surfaces.recolour(wrong[None], kind)[0]
+    for region, part in ((below, FAR_OUT), (blotches, slice(None)), (forearms, slice(None))):
+        before, after = (
+            float((voxels_of(cells) - voxels_of(right))[region, part, :3].abs().mean()) for cells in (wrong, mended)
+        )
+        assert after < 0.25 * before
+    kept = region_of(("face",))
+    assert torch.equal(mended[kept], wrong[kept])
+    assert torch.equal(voxels_of(mended)[..., 3], voxels_of(wrong)[..., 3])
+
+
+@pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {"hair": "long", "hat": "cap"}, {}])
+def test_people_without_known_surfaces_stay_as_they_are(surfaces, known):
+    cells = torch.rand(1, K, VALUES)
+    assert torch.equal(surfaces.recolour(cells, WORDS.encode({"outfit": "jumper", **known})[None]), cells)
+
+
+def test_patterned_garments_keep_their_pattern(surfaces):
+    cells = torch.rand(1, K, VALUES)
+    kind = WORDS.encode({"outfit": "tee", "pattern": "patterned", "hair": "bald", "hat": "none"})
+    top = region_of(("torso",))
+    assert torch.equal(surfaces.recolour(cells, kind[None])[:, top], cells[:, top])
+
+
+def test_few_people_or_unknown_ones_have_no_surfaces(people, codec):
+    few = people.geometry % GEOMETRIES == 1  # three geometries
+    some = dataclasses.replace(
+        people, latents=people.latents[few], geometry=people.geometry[few], condition=people.condition[few],
+        detailed=few.sum(),
+    )  # fmt: skip
+    assert fit_surfaces(some, codec, WORDS, PriorConfig()) is None
+    assert fit_surfaces(people, codec, WORDS, PriorConfig(outfit="nothing", hair="nothing")) is None
+
+
+def model_with_surfaces():
+    """Women in jeans, who have a surface, and men in suits."""
+    model = model_of_two_kinds()
+    generator = torch.Generator().manual_seed(0)
+    share, tone = (torch.rand(5, S**3, generator=generator) for _ in range(2))
+    read = torch.tensor([True, True, True, False, False])
+    surfaces = Surfaces(
+        torch.tensor([[1.0, 0, 1, 0]]), torch.zeros(5, dtype=torch.int64), torch.arange(40, 45), share,
+        BRIGHTEST * tone, read, torch.ones_like(read),
+    )  # fmt: skip
+    return dataclasses.replace(model, surfaces=surfaces), surfaces
+
+
+def test_decoding_recolours_people_who_have_the_surface():
+    model, _ = model_with_surfaces()
+    assert isinstance(model.denoiser, PersonDenoiser)
+    prior = model.denoiser.prior
+    woman, man = (prior.join(c[None], torch.zeros(1, *model.codec.shape)) for c in prior.centre[0])
+    plain = dataclasses.replace(model, surfaces=None)
+    for x0, changes in ((woman, True), (man, False)):
+        before, after = plain.decode(x0[0]), model.decode(x0[0])
+        assert torch.equal(before.density, after.density)
+        changed = (before.rgb != after.rgb).flatten(1).any(1)
+        assert bool(changed[40:45].any()) == changes
+        assert not changed[:40].any()
+    both = model.decode(torch.stack([woman, man]))  # any leading dimensions
+    assert both.rgb.shape == (2, 1, K, 3, S, S, S)
+    assert torch.equal(both.rgb[1, 0], model.decode(man[0]).rgb)
+
+
+def test_surfaces_are_stored_in_bytes(tmp_path):
+    model, surfaces = model_with_surfaces()
+    save_checkpoint(tmp_path / "model.safetensors", model, "linear")
+    loaded = load_checkpoint(tmp_path / "model.safetensors").surfaces
+    assert loaded is not None
+    torch.testing.assert_close(loaded.share, surfaces.share, atol=0.5 / 255 + 1e-6, rtol=0)
+    torch.testing.assert_close(loaded.tone, surfaces.tone, atol=0.5 * BRIGHTEST / 255 + 1e-6, rtol=0)
+    for name in ("condition", "surface", "cell", "read", "drawn"):
+        assert torch.equal(getattr(loaded, name), getattr(surfaces, name))
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        ({"cell": torch.arange(K, K + 5)}, "cell"),
+        ({"cell": torch.arange(4)}, ""),
+        ({"surface": torch.ones(5, dtype=torch.int64)}, "surface"),
+        ({"condition": torch.ones(1, 3)}, "3 values"),
+        ({"share": torch.full((5, S**3), 1.5)}, "share"),
+        ({"tone": torch.full((5, S**3), -0.5)}, "tone"),
+    ],
+)
+def test_surfaces_that_do_not_fit_are_refused(damage, named):
+    model, surfaces = model_with_surfaces()
+    with refused(ValueError, named):
+        check_surfaces(dataclasses.replace(surfaces, **damage), model.vocabulary)
