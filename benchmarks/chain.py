@@ -209,9 +209,10 @@ def payload_figures(model: DiffusionModel, assets: Assets, held: Path, count: in
             cosines.append(float(torch.nn.functional.cosine_similarity(*rest.flatten(1), dim=0)))
         unexplained.append(float((samples[0] - explained(model, samples[0])).square().mean().sqrt()))
         seconds.append(spent)
-        if number == count - 1:  # the first fit may have compiled
+        if number == count - 1:  # one after the other: the machine's speed changes
+            _, alone = fit([person], frames, base, turn=0.5)
             _, more = fit(recoloured(person, number, COLOURINGS), frames, base, turn=0.5)
-            colouring = (more - spent) / COLOURINGS
+            colouring = (more - alone) / COLOURINGS
         plain = at_density(stored(start, person.betas), FULL_DENSITY)
         for scene in posed_scenes(person):
             for view, gained in gains.items():
