@@ -58,6 +58,8 @@ class DescentSettings(Checked):
     """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
     silhouette: NotNegative = 0.05
     """Weight of the mean square error of the silhouette, relative to that of the colours."""
+    pull: NotNegative = 0.0
+    """Weight of the squared distance of values from the start, each in its own unit."""
     step: RayStep = 0.01
     """Metres between samples of a ray."""
     seed: int = 0
@@ -82,7 +84,7 @@ def descend(
     if not all(view.rgba.dtype == torch.uint8 for view in views):
         raise ValueError("the views to descend on are not sRGB bytes: encode them")
     start = start.map(lambda values: values.detach().float())
-    leaves = _Leaves.of(start)
+    leaves, first = _Leaves.of(start), _Leaves.of(start)
     groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
     adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
     fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
@@ -95,6 +97,9 @@ def descend(
         with torch.enable_grad():
             payload = own.payload(start)
             loss = torch.stack([_loss(view, payload, settings) for view in shown]).mean() / covered
+            if settings.pull:
+                far = [(leaf - began).square().sum() for leaf, began in zip(own, first, strict=True)]
+                loss = loss + settings.pull * torch.stack(far).sum() / covered
         return loss.detach(), *torch.autograd.grad(loss, own)
 
     recorded = Recorded(gradients)
