@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -41,7 +40,6 @@ from primdiffusion.render.descent import DescentSettings, descend
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, fit_payload
 from primdiffusion.version import __version__
-
 
 STARTING_SIDE, STARTING_STEPS = 96, 3
 """Largest side of the pictures, pixels, and Gauss-Newton steps with all people, after which outfits are chosen."""

@@ -2,7 +2,7 @@
 
 The objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. Adam optimises sRGB-encoded colours,
 densities and the logarithm of box sizes, which the linear solve (`inverse`) keeps. Values that no view shows have no
-gradient and stay bit-identical. There is no other regulariser.
+gradient and stay bit-identical. The only regulariser is a pull towards the start, off by default.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def descend(
     if not all(view.rgba.dtype == torch.uint8 for view in views):
         raise ValueError("the views to descend on are not sRGB bytes: encode them")
     start = start.map(lambda values: values.detach().float())
-    leaves, first = _Leaves.of(start), _Leaves.of(start)
+    leaves = _Leaves.of(start)
+    first = [leaf.detach().clone() for leaf in leaves]
     groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
     adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
     fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
