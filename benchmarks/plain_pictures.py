@@ -11,7 +11,7 @@ joint turned by 5 degrees (root mean square) about a random axis. Means over hum
     picture_psnr                   eight unseen views in the true pose, as in `from_pictures.py`; the human, whose size
                                    one picture cannot tell, is scaled and moved to the true joints
     picture_known_psnr             the same with pose, shape and camera known
-    picture_seconds_cpu            wall time, refining included
+    picture_seconds_cpu            CPU time, refining included
 
 And of the first --robust humans, camera error (camera_error_px_...) and PSNR (picture_psnr_...) with
 
@@ -130,10 +130,10 @@ def main() -> None:
             if not number:  # compiles the marcher and its gradients
                 fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
             start = given(case, photograph, model, Fault(), number)
-            began = time.perf_counter()
+            began = time.process_time()
             posture = fit_posture_in(model, [photograph], start, lambda: None).posture
             human = reconstruct(model, person_in([photograph], posture))
-            seconds = time.perf_counter() - began
+            seconds = time.process_time() - began
             views = aligned(case, human)
             row = {
                 "camera_error_px": camera_error(case, photograph, posture),

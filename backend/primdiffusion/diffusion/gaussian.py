@@ -200,8 +200,8 @@ class PersonPrior(PersonComponents):
         """The heads that kinds of a group have."""
         return self.head[group][self.log_weight[group] > IMPOSSIBLE / 2].unique().tolist()
 
-    def gaussian_of(self, group: int, head: int | None, directions: int) -> GaussianOfKinds:
-        """The mean and the leading directions of the covariance of all kinds of a group, or of those with one head."""
+    def gaussian_of(self, group: int, head: int | None = None) -> GaussianOfKinds:
+        """The mean and the covariance of all kinds of a group, or of those with one head."""
         chosen = self.log_weight[group] > IMPOSSIBLE / 2
         if head is not None:
             chosen &= self.head[group] == head
@@ -218,9 +218,7 @@ class PersonPrior(PersonComponents):
             shared.flatten(0, 1),
             weight.sqrt()[:, None] * (centre - mean),
         ]
-        factor = torch.cat(rows)
-        _, vectors = torch.linalg.eigh((factor @ factor.T).double())
-        return GaussianOfKinds(mean, vectors.flip(1)[:, :directions].T.to(factor) @ factor)
+        return GaussianOfKinds(mean, torch.cat(rows))
 
     def gaussian_of_all(self, directions: int) -> GaussianOfKinds:
         """The mean and the leading directions of the covariance of all people."""
@@ -265,6 +263,11 @@ class GaussianOfKinds(NamedTuple):
     mean: Float[Tensor, "r"]
     factor: Float[Tensor, "w r"]
 
+    def leading(self, directions: int) -> GaussianOfKinds:
+        """The same with the leading directions of the covariance alone, orthogonal to each other."""
+        _, vectors = torch.linalg.eigh((self.factor @ self.factor.T).double())
+        return self._replace(factor=vectors.flip(1)[:, :directions].T.to(self.factor) @ self.factor)
+
 
 def _diagonal(axes: Float[Tensor, "g a i"], variance: Float[Tensor, "g a"], left: Float[Tensor, "g"]) -> Tensor:
     """Variance of each coefficient in each group."""
@@ -275,7 +278,8 @@ def _pooled(
     weight: Float[Tensor, "g"], axes: Float[Tensor, "g a i"], variance: Float[Tensor, "g a"], left: Float[Tensor, "g"]
 ) -> Float[Tensor, "i i"]:
     """The weighted mean of the groups' covariances."""
-    own = torch.einsum("g,gai,ga,gaj->ij", weight, axes, variance - left[:, None], axes)
+    rows, each = axes.flatten(0, 1), weight[:, None] * (variance - left[:, None])
+    own = rows.T @ (each.flatten()[:, None] * rows)
     return own + (weight @ left) * torch.eye(axes.shape[2]).to(own)
 
 

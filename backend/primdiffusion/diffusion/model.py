@@ -54,7 +54,7 @@ STANDARD_SHAPES = ShapePrior(torch.zeros(BETAS, 0), torch.zeros(BETAS), torch.ey
 """Independent standard normal betas, for models without a shape prior."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class DiffusionModel:
     """A loaded diffusion model, ready to sample."""
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -42,29 +41,31 @@ from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, fit_payload
 from primdiffusion.version import __version__
 
+STARTING_SIDE, STARTING_STEPS = 96, 3
+"""Largest side of the pictures, pixels, and Gauss-Newton steps with all people, after which outfits are chosen."""
+
 
 class Trial(NamedTuple):
-    """A round that thins out the candidates: the outfits, then their hair styles."""
+    """A round of candidates: outfits, then those with their hair styles."""
 
+    count: int
+    """Candidates, those that explain the pictures best by the linearisation before."""
     side: int
     """Largest side of the pictures, pixels."""
-    most: int
-    """Candidates left, those that explain the pictures best."""
     steps: int
     """Gauss-Newton steps of each."""
 
 
-OUTFITS = (Trial(64, sys.maxsize, 1), Trial(64, 4, 2))
-HEADS = (Trial(64, sys.maxsize, 1), Trial(176, 2, 3))
-"""Trials of whole outfits, and of the two best outfits with each head."""
+OUTFITS, HEADS = Trial(6, 96, 2), Trial(4, 128, 2)
 BEST_OUTFITS = 2
+"""Outfits that are tried with their hair styles."""
 DIRECTIONS = 128
 """Leading directions of an outfit's people in which its coefficients are sought."""
 TRIAL_VIEWS = 2
 """Views, evenly spaced, that trials look at."""
 STEPS = 2
 """Gauss-Newton steps from there, in all views."""
-FIT_STEPS = STEPS + 1
+FIT_STEPS = STEPS + 2
 """How often `PriorFit.fit` reports."""
 OBSERVATIONS = 150.0
 """Number of independent pixels that a view counts as. What person components cannot draw differs over patches, not over
@@ -76,10 +77,13 @@ PULL, SMOOTHNESS = 2.0, 1.0
 many views, they would let one view change what only other sides show."""
 DESCENT = DescentSettings(steps=28, views=3, step=0.015)
 """Gradient descent from the encoder's human."""
+PULLED_DESCENT = DescentSettings(steps=28, views=3, step=0.01, pull=0.04)
+"""Gradient descent from the prior's human in one view, whose pull each further view outweighs more: without it, the
+given view gains 5 dB and the others lose 2."""
 DESCENT_SIDE = 256
 """Largest side of the images that its steps draw, pixels: every second pixel of images of 512 pixels."""
-COARSE_SIDE, FINE_SIDE = 176, 512
-"""Largest sides of the pictures for coefficients and for voxels, pixels."""
+COARSE_SIDE, FINE_SIDE = 176, 256
+"""Largest sides of the pictures for coefficients and for voxels, pixels; the descent sees every pixel."""
 
 
 def reconstruct(
@@ -132,13 +136,23 @@ def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"])
     payload = model.encode(views, betas)
     frames = frames_of(model.config, betas.cpu(), views.pose.to("cpu"), model.body_setup)[1]
     views, frames = views.to(payload.density.device), frames.to(payload.density.device)
+    if model.config.compat == "released":
+        return payload
+    return _descended(payload, views, [frames] * len(views.rgba), DESCENT, model.config.full_density)
+
+
+def _descended(
+    payload: Payload, views: Views, frames: Sequence[Frames], settings: DescentSettings, full_density: float
+) -> Payload:
+    """The payload after a descent on the views that show the subject; itself if none does."""
     cameras = [views.camera.map(lambda values, i=i: values[i]) for i in range(len(views.rgba))]
-    images = [PosedView(frames, camera, rgba) for camera, rgba in zip(cameras, views.rgba, strict=True)]
+    images = map(PosedView, frames, cameras, views.rgba)
     seen = [image for image in images if _shows(image)]
-    if model.config.compat == "released" or not seen:
+    if not seen:
         return payload
     stride = math.ceil(max(views.camera.width, views.camera.height) / DESCENT_SIDE)
-    settings = dataclasses.replace(DESCENT, stride=stride, largest_density=model.config.full_density)
+    together, pull = min(settings.views, len(seen)), settings.pull / len(seen)
+    settings = dataclasses.replace(settings, views=together, stride=stride, pull=pull, largest_density=full_density)
     return descend(payload, seen, settings)
 
 
@@ -146,6 +160,10 @@ def _shows(image: PosedView) -> bool:
     """Whether an image shows the subject, and its camera faces it."""
     depth = image.camera.project(image.frames.position)[1]
     return bool(image.rgba[..., 3].any()) and bool((depth > 0).any())
+
+
+Kind = tuple[int, int | None]
+"""An outfit and a head, or all heads."""
 
 
 class Explanation(NamedTuple):
@@ -172,6 +190,7 @@ class PriorFit:
     _latest: list = dataclasses.field(default_factory=lambda: [None, None], repr=False)
 
     @classmethod
+    @functools.lru_cache(maxsize=1)  # the directions of all people take a second
     def of(cls, model: DiffusionModel) -> PriorFit:
         """Those of a model; ValueError if it has none, or is of another body than the default one."""
         if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
@@ -188,31 +207,32 @@ class PriorFit:
     def start_steps(self) -> int:
         """How often `start` reports."""
         groups = len(self.prior.log_weight)
-        heads = min(groups, BEST_OUTFITS) * max(len(self.prior.heads_of(group)) for group in range(groups))
-        rounds = [(trial, groups) for trial in OUTFITS] + [(trial, heads) for trial in HEADS]
-        return sum(min(trial.most, count) * trial.steps for trial, count in rounds)
+        heads = sum(sorted(len(self.prior.heads_of(group)) for group in range(groups))[-BEST_OUTFITS:])
+        trials = min(OUTFITS.count, groups) * OUTFITS.steps + min(HEADS.count, heads) * HEADS.steps
+        return STARTING_STEPS + trials
 
     @functools.cached_property
     def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
         return self.codec.voxel_basis(self.prior.basis.shape[2]).contiguous().numpy()
 
-    @functools.cached_property
-    def _components(self) -> Float[Tensor, "k d n"]:
-        """What the components of a box's part add to its channels; boxes in their own order."""
-        order = self.prior.part.argsort(stable=True)
-        return self.prior.basis[:, order.argsort()].permute(1, 2, 0)
-
     def _kinds(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
         """People of an outfit and head, and channels of each box by their weights; those asked for last are kept."""
+        if group is None:
+            return self._everyone
         if (group, head) != self._latest[0]:
-            self._latest[:] = [(group, head), self._kinds_of(group, head)]
+            self._latest[:] = [(group, head), self._codes_of(self.prior.gaussian_of(group, head).leading(DIRECTIONS))]
         return self._latest[1]
 
-    def _kinds_of(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
-        everyone = group is None
-        kinds = self.prior.gaussian_of_all(DIRECTIONS) if everyone else self.prior.gaussian_of(group, head, DIRECTIONS)
-        by_part = kinds.factor.unflatten(1, (-1, len(self.prior.basis))).permute(1, 2, 0)
-        return kinds, torch.bmm(self._components, by_part[self.prior.part]).numpy()
+    @functools.cached_property
+    def _everyone(self) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
+        return self._codes_of(self.prior.gaussian_of_all(DIRECTIONS))
+
+    def _codes_of(self, kinds: GaussianOfKinds) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
+        codes = torch.empty(*self.prior.basis.shape[1:], len(kinds.factor))
+        by_part = kinds.factor.unflatten(1, (-1, len(self.prior.basis))).unbind(1)
+        for part, (basis, own) in enumerate(zip(self.prior.bases(), by_part, strict=True)):
+            codes[self.prior.part == part] = (basis.flatten(1).T @ own.T).unflatten(0, basis.shape[1:])
+        return kinds, codes.numpy()
 
     def coefficients(self, explanation: Explanation) -> Float[Tensor, "r"]:
         """Person coefficients of these people."""
@@ -227,23 +247,49 @@ class PriorFit:
     def start(self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None) -> Explanation:
         """The people nearest to the human in views with these frames; reports `start_steps` times."""
         every, steps = math.ceil(len(frames) / TRIAL_VIEWS), self.start_steps
-        candidates = [self._mean_of(group, None) for group in range(len(self.prior.log_weight))]
-        for trials in (OUTFITS, HEADS):
-            for trial in trials:
-                targets = targets_of(views, frames, trial.side)[::every]
-                candidates = best(candidates, trial.most)
-                for number, explanation in enumerate(candidates):
-                    for _ in range(trial.steps):
-                        explanation = self.closer(explanation, targets)
-                        on_step()
-                        steps -= 1
-                    candidates[number] = explanation
-            if trials is OUTFITS:
-                groups = [int(one.group or 0) for one in best(candidates, BEST_OUTFITS)]
-                candidates = [self._mean_of(group, head) for group in groups for head in self.prior.heads_of(group)]
+
+        def stepped(people: Explanation, side: int, count: int) -> Explanation:
+            nonlocal steps
+            for _ in range(count):
+                people, steps = self.closer(people, targets_of(views, frames, side)[::every]), steps - 1
+                on_step()
+            return people
+
+        def tried(people: Sequence[Explanation], kinds: Sequence[Sequence[Kind]], trial: Trial) -> list[Explanation]:
+            targets = targets_of(views, frames, trial.side)[::every]
+            found = [one for each, own in zip(people, kinds, strict=True) for one in self.within(each, own, targets)]
+            chosen = best(found, trial.count)
+            return [stepped(self._mean_of(one.group, one.head), trial.side, trial.steps) for one in chosen]
+
+        people = stepped(self.everyone(), STARTING_SIDE, STARTING_STEPS)
+        groups = [(group, None) for group in range(len(self.prior.log_weight))]
+        outfits = best(tried([people], [groups], OUTFITS), BEST_OUTFITS)
+        heads = [[(int(one.group or 0), head) for head in self.prior.heads_of(int(one.group or 0))] for one in outfits]
+        found = best(tried(outfits, heads, HEADS), 1)[0]
         for _ in range(steps):  # of outfits with fewer hair styles than others
             on_step()
-        return best(candidates, 1)[0]
+        return found
+
+    def within(
+        self, explanation: Explanation, kinds: Sequence[Kind], targets: Sequence[PosedView]
+    ) -> list[Explanation]:
+        """How well kinds of the people explain pictures that are linearised at these weights, without their weights.
+
+        Kinds are seen in the directions of the people: fast, and near enough to choose those worth a step of their own.
+        """
+        of, _ = self._kinds(explanation.group, explanation.head)
+        precision, vector, misfit = self._information(explanation, targets)
+        precision, vector, into = precision.double(), vector.double(), torch.linalg.pinv(of.factor)
+        found = []
+        for group, head in kinds:
+            own = self.prior.gaussian_of(group, head)
+            mean, factor = ((own.mean - of.mean) @ into).double(), (own.factor @ into).double()
+            covariance, slope = factor.T @ factor, vector - precision @ mean
+            spread = torch.eye(len(mean)) + covariance @ precision
+            gain = slope @ torch.linalg.solve(spread, covariance @ slope) - torch.linalg.slogdet(spread).logabsdet
+            evidence = float(gain / 2 + (vector + slope) @ mean / 2) - misfit
+            found.append(Explanation(group, head, mean.new_zeros(0), evidence))
+        return found
 
     def everyone(self) -> Explanation:
         """All people, at the mean human."""
@@ -261,7 +307,8 @@ class PriorFit:
         on_step: Callable[[], None] = lambda: None,
         generator: torch.Generator | None = None,
     ) -> Payload:
-        """The human in views with these frames: STEPS steps from there, then voxels. Reports FIT_STEPS times.
+        """The human in views with these frames: STEPS steps from there, then voxels, then box sizes too. Reports
+        FIT_STEPS times.
 
         With a generator, coefficients are drawn from their distribution given the views, and the rest from that given
         the coefficients, instead of their means: what no view shows varies with it.
@@ -276,6 +323,8 @@ class PriorFit:
         rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
         start = self.payload(coefficients, rest)
         payload = fit_payload(start, targets, self.full_density, settings)
+        on_step()
+        payload = _descended(payload, views, frames, PULLED_DESCENT, self.full_density)
         on_step()
         return payload
 
@@ -306,6 +355,19 @@ class PriorFit:
         self, explanation: Explanation, targets: Sequence[PosedView], generator: torch.Generator | None = None
     ) -> Explanation:
         """A step of Gauss-Newton from these weights, to their posterior mean or, with a generator, to a draw."""
+        precision, vector, misfit = self._information(explanation, targets)
+        factor = torch.linalg.cholesky(precision.double() + torch.eye(len(vector)))
+        mean = torch.cholesky_solve(vector.double()[:, None], factor)[:, 0]
+        evidence = float(mean @ vector.double()) / 2 - float(factor.diagonal().log().sum()) - misfit
+        if generator is not None:
+            noise = torch.randn(len(mean), 1, generator=generator, dtype=mean.dtype)
+            mean = mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
+        return Explanation(explanation.group, explanation.head, mean.float(), evidence)
+
+    def _information(
+        self, explanation: Explanation, targets: Sequence[PosedView]
+    ) -> tuple[Float[Tensor, "n n"], Float[Tensor, "n"], float]:
+        """Pictures, linearised at these weights: their log probability is vector w - w precision w / 2 - misfit."""
         prior, codec = self.prior, self.codec
         kinds, codes = self._kinds(explanation.group, explanation.head)
         weights = explanation.weights
@@ -317,8 +379,8 @@ class PriorFit:
         (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
         slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
         payload, region = payload.map(Tensor.detach), codec.region.numpy()
-        precision, vector = torch.eye(len(weights)), torch.zeros(len(weights))
-        misfit = 0.0  # of weights of 0, by the linearisation
+        precision, vector = torch.zeros(len(weights), len(weights)), torch.zeros(len(weights))
+        misfit = 0.0  # of weights of 0
         for target in targets:
             view = LinearisedView.of(target, payload, InverseSettings())
             seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
@@ -332,13 +394,7 @@ class PriorFit:
             vector += weighted @ wanted
             misfit += float(weight.double() @ wanted.double().square()) / 2
             misfit += float((pixel_weights[~seen] * view.residual[~seen] ** 2).sum(dtype=np.float64)) / 2
-        factor = torch.linalg.cholesky(precision.double())
-        mean = torch.cholesky_solve(vector.double()[:, None], factor)[:, 0]
-        evidence = float(mean @ vector.double()) / 2 - float(factor.diagonal().log().sum()) - misfit
-        if generator is not None:
-            noise = torch.randn(len(mean), 1, generator=generator, dtype=mean.dtype)
-            mean = mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
-        return Explanation(explanation.group, explanation.head, mean.float(), evidence)
+        return precision, vector, misfit
 
 
 def best(candidates: Sequence[Explanation], count: int) -> list[Explanation]:

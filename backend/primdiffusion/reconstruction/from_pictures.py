@@ -49,7 +49,7 @@ class Round(NamedTuple):
     coefficient_steps: int
 
 
-ROUNDS = (Round(96, Stage(60, 0.04, upright=False), 2), Round(96, Stage(80, 0.02), 2), Round(192, Stage(60, 0.01), 0))
+ROUNDS = (Round(96, Stage(40, 0.04, upright=False), 2), Round(96, Stage(50, 0.02), 2), Round(192, Stage(40, 0.01), 0))
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""

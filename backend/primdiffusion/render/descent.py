@@ -2,7 +2,7 @@
 
 The objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. Adam optimises sRGB-encoded colours,
 densities and the logarithm of box sizes, which the linear solve (`inverse`) keeps. Values that no view shows have no
-gradient and stay bit-identical. There is no other regulariser.
+gradient and stay bit-identical. The only regulariser is a pull towards the start, off by default.
 """
 
 from __future__ import annotations
@@ -58,6 +58,8 @@ class DescentSettings(Checked):
     """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
     silhouette: NotNegative = 0.05
     """Weight of the mean square error of the silhouette, relative to that of the colours."""
+    pull: NotNegative = 0.0
+    """Weight of the squared distance of values from the start, each in its own unit."""
     step: RayStep = 0.01
     """Metres between samples of a ray."""
     seed: int = 0
@@ -83,6 +85,7 @@ def descend(
         raise ValueError("the views to descend on are not sRGB bytes: encode them")
     start = start.map(lambda values: values.detach().float())
     leaves = _Leaves.of(start)
+    first = [leaf.detach().clone() for leaf in leaves]
     groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
     adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
     fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
@@ -95,6 +98,9 @@ def descend(
         with torch.enable_grad():
             payload = own.payload(start)
             loss = torch.stack([_loss(view, payload, settings) for view in shown]).mean() / covered
+            if settings.pull:
+                far = [(leaf - began).square().sum() for leaf, began in zip(own, first, strict=True)]
+                loss = loss + settings.pull * torch.stack(far).sum() / covered
         return loss.detach(), *torch.autograd.grad(loss, own)
 
     recorded = Recorded(gradients)

@@ -110,10 +110,10 @@ def test_people_of_a_group_are_one_gaussian_with_their_mean_and_covariance(head)
         w * (coefficient_covariance(prior, 0, kind) + torch.outer(*2 * [prior.centre[0, kind] - mean]))
         for w, kind in zip(weight, kinds, strict=True)
     )
-    found = prior.gaussian_of(0, head, directions=20)
+    found = prior.gaussian_of(0, head).leading(20)
     assert torch.allclose(found.mean, mean)
     assert torch.allclose(found.factor.T @ found.factor, wanted, atol=1e-6)
-    leading = prior.gaussian_of(0, head, directions=2).factor
+    leading = found.leading(2).factor
     assert torch.allclose(leading.square().sum(), torch.linalg.eigvalsh(wanted)[-2:].sum(), rtol=1e-5)
     assert prior.heads_of(0) == [0, 1]
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
@@ -28,6 +29,7 @@ from primdiffusion.reconstruction.from_captures import (
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
+from scipy.stats import multivariate_normal
 from support.errors import refused
 from support.priors import of_whole_body
 from support.tiny import SLOW, TINY, tiny_encoder, tiny_model
@@ -142,6 +144,52 @@ def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice()
     view = LinearisedView.of(targets[0], mean_human, InverseSettings())
     wanted = -OBSERVATIONS / PIXEL_STD**2 * float((view.weight * view.residual**2).sum()) / 2
     assert components.closer(everyone, targets).evidence == pytest.approx(wanted, rel=1e-3)
+
+
+def test_kinds_within_people_explain_pictures_as_their_gaussian_does():
+    group = torch.stack([torch.zeros(3), torch.tensor([8.0, -4.0, 2.0])])[:, None].repeat(1, 2, 1)
+    variance = torch.tensor([[30.0, 20.0, 10.0], [4.0, 9.0, 1.0]]) ** 2
+    parts = {name: getattr(PRIOR, name) for name in ("mean", "parity", "rest_variance")}
+    prior = of_whole_body(
+        **parts, basis=PRIOR.basis.mT.flatten(1), log_weight=torch.full((2, 2), 0.25).log(), centre=group,
+        axes=PRIOR.axes.repeat(2, 1, 1), variance=variance, kind=PRIOR.kind.repeat(2, 1, 1),
+    )  # fmt: skip
+    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior, _latest=[None, None])
+    human = human_of(COLOURS / 10)
+    targets = targets_of(captured(human, BodyPose.rest(), [0.0]).views, [frames_of(human)], 64)
+    everyone = components.everyone()
+    precision, vector, misfit = components._information(everyone, targets)
+    people, precision = components._kinds(None, None)[0], precision.double().numpy()
+    mean = np.linalg.solve(precision, vector.double().numpy())  # the picture alone, as a Gaussian of weights
+    height = (
+        vector.double().numpy() @ mean / 2 - misfit + np.linalg.slogdet(2 * np.pi * np.linalg.inv(precision))[1] / 2
+    )
+    into = np.linalg.inv(people.factor.double().numpy())
+    for number, found in enumerate(components.within(everyone, [(0, None), (1, 0)], targets)):
+        spread = into.T @ np.diag(variance[number].double()) @ into + np.linalg.inv(precision)
+        centre = (group[number, 0] - people.mean).double().numpy() @ into
+        assert found.evidence == pytest.approx(height + multivariate_normal(centre, spread).logpdf(mean), rel=1e-3)
+    assert found.group == 1
+
+
+def test_the_voxels_follow_the_given_view_beyond_the_linear_fit(monkeypatch):
+    human = human_of(COLOURS)
+    noise = torch.rand(human.payload.rgb.shape, generator=torch.Generator().manual_seed(0))
+    noisy = dataclasses.replace(human, payload=dataclasses.replace(human.payload, rgb=noise))
+    person = captured(noisy, BodyPose.rest(), [0.0])
+    (target,) = targets_of(person.views, [frames_of(human)], 128)
+
+    def found() -> tuple[Payload, float]:
+        payload = reconstruct(MODEL, person).payload
+        drawn = march(Primitives.place(target.frames, payload), target.camera)
+        return payload, float((encode_srgb(drawn.rgb) - encode_srgb(target.rgba[..., :3])).square().mean())
+
+    payload, error = found()
+    monkeypatch.setattr(from_captures, "descend", lambda start, *_: start)
+    linear, before = found()
+    assert error < 0.8 * before
+    behind = frames_of(human).rotation[:, 2, 2] < -0.7
+    assert (payload.rgb[behind] - linear.rgb[behind]).abs().mean() < 0.01
 
 
 def test_a_seed_draws_the_rest_too():

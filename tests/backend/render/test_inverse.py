@@ -242,6 +242,17 @@ def test_no_pixel_is_left_out():
     assert 0.6 < brightness < 0.9  # three quarters of the pixels are grey
 
 
+def test_the_stronger_a_pull_the_nearer_the_fit_stays_to_its_start():
+    wanted, start = smooth_payload(1), smooth_payload(2)
+    views, far, wrong = views_of(wanted), [], []
+    for pull in (0.0, 0.1, 10.0):
+        fitted = descend(start, views, DescentSettings(steps=STEPS, step=0.004, pull=pull))
+        far.append(float((encode_srgb(fitted.rgb) - encode_srgb(start.rgb)).square().mean()))
+        wrong.append(float(errors(views, fitted).mean()))
+    assert far[0] > 1.5 * far[1] > 10 * far[2]
+    assert wrong[0] < wrong[1] < wrong[2] < float(errors(views, start).mean())
+
+
 def test_linear_pictures_are_refused():
     view = views_of(smooth_payload(1), count=1)[0]
     with refused(ValueError, "sRGB"):
