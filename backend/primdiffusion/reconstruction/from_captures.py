@@ -187,6 +187,8 @@ class PriorFit:
     prior: PersonPrior
     codec: LinearCodec
     full_density: float
+    decode: Callable[[Tensor], Payload]
+    """That of the model, whose surfaces have one colour each, on the CPU."""
     _latest: list = dataclasses.field(default_factory=lambda: [None, None], repr=False)
 
     @classmethod
@@ -201,7 +203,10 @@ class PriorFit:
             )
         chain = model.chain(model.schedule.length, requests.Sampling.steps)
         codec = model.codec.codec.to("cpu")
-        return cls(model.denoiser, chain, model.denoiser.prior.to("cpu"), codec, model.full_density)
+        prior, device = model.denoiser.prior.to("cpu"), model.device
+        return cls(
+            model.denoiser, chain, prior, codec, model.full_density, lambda x0: model.decode(x0.to(device)).to("cpu")
+        )
 
     @property
     def start_steps(self) -> int:
@@ -239,9 +244,9 @@ class PriorFit:
         kinds, _ = self._kinds(explanation.group, explanation.head)
         return kinds.mean + explanation.weights @ kinds.factor
 
-    def payload(self, coefficients: Float[Tensor, "r"], rest: Float[Tensor, "c h w"] | float = 0.0) -> Payload:
+    def payload(self, coefficients: Float[Tensor, "r"]) -> Payload:
         """Decode."""
-        latents = self.prior.mean + self.prior.picture(coefficients[None]) + rest
+        latents = self.prior.mean + self.prior.picture(coefficients[None])
         return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
 
     def start(self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None) -> Explanation:
@@ -321,7 +326,7 @@ class PriorFit:
         settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
         coefficients = self.coefficients(explanation)
         rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
-        start = self.payload(coefficients, rest)
+        start = self.decode(self.prior.join(coefficients[None], rest[None])[0])
         payload = fit_payload(start, targets, self.full_density, settings)
         on_step()
         payload = _descended(payload, views, frames, PULLED_DESCENT, self.full_density)

@@ -10,11 +10,12 @@ from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import sample
+from primdiffusion.diffusion.surfaces import Surfaces
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
-from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.primitives.primitives import Payload, Primitives, S
 from primdiffusion.reconstruction import from_captures
 from primdiffusion.reconstruction.from_captures import (
     FIT_STEPS,
@@ -67,6 +68,22 @@ def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(y
     assert (got - wanted).abs().flatten(1).mean(1).max() < 0.02
     assert torch.equal(found.betas, BETAS)
     assert (found.provenance["reconstructed_from"], found.provenance["views"]) == ("anna", list(range(len(yaws))))
+
+
+def test_unseen_sides_have_surfaces_of_one_colour():
+    depth = place(human_of(COLOURS), BodyPose.rest()).position[:, 2]
+    front, back = depth.argmax()[None], depth.argmin()[None]
+    ones = torch.ones(2, S**3)
+    surfaces = Surfaces(
+        torch.zeros(1, MODEL.vocabulary.width), torch.zeros(2, dtype=torch.int64), torch.cat([front, back]), ones,
+        torch.stack([ones[0], 0.5 * ones[0]]), torch.tensor([True, False]), torch.tensor([False, True]),
+    )  # fmt: skip
+    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
+    plain, found = (
+        encode_srgb(reconstruct(dataclasses.replace(MODEL, surfaces=each), person).payload.rgb)
+        for each in (None, surfaces)
+    )
+    torch.testing.assert_close(found[back], 0.5 * plain[back], atol=0.02, rtol=0)
 
 
 def test_the_more_views_the_nearer_the_human_is_to_what_they_show():
