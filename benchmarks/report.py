@@ -44,6 +44,8 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("one view: the view itself", "from_pictures", "one_view_seen_psnr", "dB"),
         ("16 frames of one view", "from_pictures", "frames_16_psnr", "dB"),
         ("a picture without a camera: its joints", "plain_pictures", "camera_error_px", "px"),
+        ("a picture of a tilted camera: lean of the torso, median", "upright", "lean_error_median_deg", "degrees"),
+        ("the same: one foot's sole above the other, median", "upright", "feet_plane_median_cm", "cm"),
     ),
     "Generated humans": (
         ("a human, 30 steps", "diffusion", "generate_seconds_cpu", "s"),
