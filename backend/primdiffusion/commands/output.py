@@ -25,6 +25,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.files.regular_files import remove_file
+from primdiffusion.formats.answers import VariationFiles
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import Compositing
 from primdiffusion.geometry.camera import Camera
@@ -100,6 +101,11 @@ def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
     save_human(path, human, compact=compact)
     if human.body_setup is not None:
         save_body(path.with_name(FILES.body), human.body_setup.body, human.body_setup.anchors)
+
+
+def variation_files(folder: Path, seed: int) -> VariationFiles:
+    """The files of one of several humans."""
+    return VariationFiles(seed=seed, person=folder / f"{seed}.human.safetensors", picture=folder / f"{seed}.png")
 
 
 _compiler: list[BaseProcess] = []
@@ -242,6 +248,12 @@ def draw_front(path: Path, human: Human, px: int, compositing: Compositing = "li
     """Draw the human in the T pose from the front, px x px pixels with a transparent background."""
     primitives = place(human)
     draw(path, primitives, framing(primitives, 0, px, px), None, compositing)
+
+
+def draw_back(path: Path, human: Human, px: int) -> None:
+    """Draw the human with lowered arms from behind, px x px pixels with a transparent background."""
+    primitives = place(human, a_pose())
+    draw(path, primitives, framing(primitives, THREE_QUARTERS + 180, px, px), None, "linear")
 
 
 def draw_front_and_back(path: Path, human: Human, px: int) -> None:
