@@ -110,7 +110,8 @@ def add_picture_camera(context: bpy.types.Context, paths: Sequence[Path], place:
         background.image, background.alpha, background.frame_method = image, 0.6, "FIT"
         background.show_background_image = image == images[0]
     width, height = images[0].size
-    data.sensor_fit, data.angle = "AUTO", np.radians(LONG_SIDE_DEGREES)
+    across = np.tan(np.radians(LONG_SIDE_DEGREES / 2)) * width / max(width, height)
+    data.sensor_fit, data.angle = "HORIZONTAL", 2 * np.arctan(across)  # as `aim`: views keep the frame's size
     camera.rotation_euler = (np.pi / 2, 0, 0)
     camera.location = (place[0], place[1] - AWAY_M, place[2] + HEIGHT_M)
     render = context.scene.render

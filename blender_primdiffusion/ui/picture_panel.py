@@ -78,8 +78,7 @@ class PRIMDIFFUSION_OT_choose_picture(Reporting, bpy.types.Operator):
         person = _posed(context)
         place = np.zeros(3) if person is None else np.array(person.matrix_world.translation)
         camera = add_picture_camera(context, paths, place)
-        # bits of a pixel with alpha, of 8 and more in a channel
-        marked = all(image.depth in (32, 128) for image in pictures_of(camera))
+        marked = all(image.depth in (32, 128) for image in pictures_of(camera))  # bits of a pixel with alpha
         if person is None and not (marked or context.scene.primdiffusion_picture.mask):
             _stand(context, build_human(context, min(FOLDER.glob("*.human"))))
         if context.region_data is not None:

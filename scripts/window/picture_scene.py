@@ -20,13 +20,13 @@ _MOST_S = 1500.0
 
 def from_picture(module: str, python: str) -> Steps:
     """One standing human from its picture alone, and one with raised arms from a human posed over the picture."""
-    yield from from_a_standing_start(module, python)
-    yield from from_a_photograph(module, python)
+    picture = yield from drawn(module, python, FIRST_SEED, "Relaxed")
+    yield from from_a_photograph(module, python, picture)
+    yield from from_a_standing_start(module, python, picture)
     yield from from_a_posed_start(module, python)
 
 
-def from_a_standing_start(module: str, python: str) -> Steps:
-    picture = yield from drawn(module, python, FIRST_SEED, "Relaxed")
+def from_a_standing_start(module: str, python: str, picture: Path) -> Steps:
     yield from chosen(module, python, picture)
     yield "picture_chosen"
     yield from pressed(module, "picture_fitting")
@@ -41,14 +41,12 @@ def from_a_standing_start(module: str, python: str) -> Steps:
     yield "picture_from_the_side"
 
 
-def from_a_photograph(module: str, python: str) -> Steps:
+def from_a_photograph(module: str, python: str, picture: Path) -> Steps:
     """A human with lowered arms stands ready to be posed over a picture without alpha; several pictures at once."""
-    picture = yield from drawn(module, python, FIRST_SEED, "Relaxed")
     names = [f"photograph_{number}.jpg" for number in range(3)]
+    bpy.context.scene.render.image_settings.file_format = "JPEG"
     for name in names:
-        image = bpy.data.images.load(str(picture))
-        image.file_format = "JPEG"
-        image.save(filepath=str(picture.with_name(name)))
+        bpy.data.images["Render Result"].save_render(str(picture.with_name(name)))
     yield from chosen(module, python, picture.with_name(names[0]))
     yield "picture_photograph"
     files = [{"name": name} for name in names]
@@ -67,6 +65,7 @@ def from_a_posed_start(module: str, python: str) -> Steps:
     select(armature)
     pose(armature, "Waving")
     armature.rotation_euler.z += math.radians(8)
+    bpy.context.scene.primdiffusion_picture.backs = 0
     yield from at_rest(module)
     yield "picture_posed"
     yield from pressed(module, "picture_posed_fitting", only_fit=True)
@@ -85,6 +84,7 @@ def drawn(module: str, python: str, seed: int, name: str) -> Steps:
     select(armature)
     pose(armature, name)
     press("view3d.view_axis", "EXEC_DEFAULT", type="FRONT")
+    yield 1.0
     press("view3d.camera_to_view_selected", "EXEC_DEFAULT")
     scene = bpy.context.scene
     scene.camera.data.lens *= _CLOSER

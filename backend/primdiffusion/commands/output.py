@@ -251,16 +251,19 @@ def draw_front(path: Path, human: Human, px: int, compositing: Compositing = "li
 
 
 def draw_back(path: Path, human: Human, px: int) -> None:
-    """Draw the human with lowered arms from behind, px x px pixels with a transparent background."""
-    primitives = place(human, a_pose())
-    draw(path, primitives, framing(primitives, THREE_QUARTERS + 180, px, px), None, "linear")
+    """Draw the human as `draw_front_and_back` does, twice from behind: to the left and to the right."""
+    _draw_side_by_side(path, human, px, (180 - THREE_QUARTERS, 180 + THREE_QUARTERS))
 
 
 def draw_front_and_back(path: Path, human: Human, px: int) -> None:
     """Draw the human with lowered arms, front and back side by side, px x px pixels with a transparent background."""
+    _draw_side_by_side(path, human, px, (THREE_QUARTERS, THREE_QUARTERS + 180))
+
+
+def _draw_side_by_side(path: Path, human: Human, px: int, angles: tuple[float, float]) -> None:
     primitives = place(human, a_pose())
     views = []
-    for degrees in (THREE_QUARTERS, THREE_QUARTERS + 180):
+    for degrees in angles:
         view = march(primitives, framing(primitives, degrees, px // 2, px))
         views.append(torch.cat([view.rgb, view.alpha[..., None]], dim=-1))
     rgba_to_png(path, torch.cat(views, dim=1), None)

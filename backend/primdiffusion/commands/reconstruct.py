@@ -70,7 +70,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
             model = session.model(request.checkpoint)
             person = person_in_pictures(model, *_files(request), refine=request.refine, on_step=on_step)
             _write_found(folder, person)
-            if len(request.pictures) == 1:
+            if len(request.pictures) == 1 and not request.backs:
                 warnings.append("only one picture: the sides that it does not show are guessed")
         else:
             report("read", 1, STAGES, None)
