@@ -24,7 +24,6 @@ from .drawing import BackendPanel, draw_job, property_columns
 from .menus import FOLDER
 from .variations_panel import draw_people
 
-MOST_PICTURES = 8
 _LOWERED = {"left_shoulder": -1.0, "right_shoulder": 1.0}  # radians about z, from the T pose
 
 
@@ -73,14 +72,15 @@ class PRIMDIFFUSION_OT_choose_picture(Reporting, bpy.types.Operator):
         paths = [folder / name for name in names] or [Path(bpy.path.abspath(self.filepath))]
         if not (names or self.filepath):
             raise ValueError("choose a picture first")
-        if len(paths) > MOST_PICTURES:
-            raise ValueError(f"{len(paths)} pictures are chosen: choose up to {MOST_PICTURES} of one person")
+        if len(paths) > 8:  # each adds seconds to every step of the fit
+            raise ValueError(f"{len(paths)} pictures are chosen: choose up to 8 of one person")
         person = _posed(context)
         place = np.zeros(3) if person is None else np.array(person.matrix_world.translation)
         camera = add_picture_camera(context, paths, place)
         marked = all(image.depth in (32, 128) for image in pictures_of(camera))  # bits of a pixel with alpha
         if person is None and not (marked or context.scene.primdiffusion_picture.mask):
             _stand(context, build_human(context, min(FOLDER.glob("*.human"))))
+            self.report({"INFO"}, "Pose the human over the person in the picture, then press Make Human")
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
             bpy.ops.view3d.view_center_camera()
