@@ -35,6 +35,7 @@ def from_a_standing_start(module: str, python: str, picture: Path) -> Steps:
     yield "picture_made"
     if press("primdiffusion.human_from_picture", back=2) != {"FINISHED"}:
         raise RuntimeError("the back was not shown")
+    queue_of(module).outcomes.clear()
     yield from at_rest(module)
     yield "picture_another_back"
     bpy.context.view_layer.objects.active.select_set(False)
