@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -87,32 +88,30 @@ def _frame(camera: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.fl
     return points_to_backend(axes.T).T, points_to_backend(world[:3, 3])
 
 
-def add_picture_camera(context: bpy.types.Context, path: Path, place: np.ndarray) -> bpy.types.Object:
-    """Add a camera with the picture as its background, facing a human at `place` [3] (Blender's axes), and make it the
-    scene's, whose render size becomes the picture's.
+def add_picture_camera(context: bpy.types.Context, paths: Sequence[Path], place: np.ndarray) -> bpy.types.Object:
+    """Add a camera with the pictures as its backgrounds, facing a human at `place` [3] (Blender's axes), and make it
+    the scene's, whose render size becomes that of the first picture, which alone is shown.
 
     Raises ValueError for what is not a picture or is stored turned, and then leaves nothing.
     """
-    if stored_turned(path):
-        raise ValueError(
-            f"{path.name!r} is stored turned, with a note in its EXIF data that Blender ignores: rotate it in another "
-            "program and save it without that note"
-        )
+    images: list[bpy.types.Image] = []
     try:
-        image = bpy.data.images.load(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{str(path)!r} is not a picture that Blender can read: choose a PNG or JPEG") from error
-    width, height = image.size
-    if min(width, height) < 1:
-        bpy.data.images.remove(image)
-        raise ValueError(f"{str(path)!r} is not a picture that Blender can read: choose a PNG or JPEG")
+        for path in paths:
+            images.append(_picture(path))
+    except ValueError:
+        bpy.data.batch_remove(images)
+        raise
     data = bpy.data.cameras.new(NAME)
     camera = bpy.data.objects.new(NAME, data)
     context.scene.collection.objects.link(camera)
     data.show_background_images = True
-    background = data.background_images.new()
-    background.image, background.alpha, background.frame_method = image, 0.6, "FIT"
-    data.sensor_fit, data.angle = "AUTO", np.radians(LONG_SIDE_DEGREES)
+    for image in images:
+        background = data.background_images.new()
+        background.image, background.alpha, background.frame_method = image, 0.6, "FIT"
+        background.show_background_image = image == images[0]
+    width, height = images[0].size
+    across = np.tan(np.radians(LONG_SIDE_DEGREES / 2)) * width / max(width, height)
+    data.sensor_fit, data.angle = "HORIZONTAL", 2 * np.arctan(across)  # as `aim`: views keep the frame's size
     camera.rotation_euler = (np.pi / 2, 0, 0)
     camera.location = (place[0], place[1] - AWAY_M, place[2] + HEIGHT_M)
     render = context.scene.render
@@ -123,12 +122,28 @@ def add_picture_camera(context: bpy.types.Context, path: Path, place: np.ndarray
     return camera
 
 
-def picture_of(camera: bpy.types.Object | None) -> bpy.types.Image | None:
-    """The picture in a camera's background; None if there is none."""
+def _picture(path: Path) -> bpy.types.Image:
+    if stored_turned(path):
+        raise ValueError(
+            f"{path.name!r} is stored turned, with a note in its EXIF data that Blender ignores: rotate it in another "
+            "program and save it without that note"
+        )
+    no_picture = f"{str(path)!r} is not a picture that Blender can read: choose a PNG or JPEG"
+    try:
+        image = bpy.data.images.load(str(path))
+    except RuntimeError as error:
+        raise ValueError(no_picture) from error
+    if min(image.size) < 1:
+        bpy.data.images.remove(image)
+        raise ValueError(no_picture)
+    return image
+
+
+def pictures_of(camera: bpy.types.Object | None) -> list[bpy.types.Image]:
+    """The pictures in a camera's background."""
     if camera is None or camera.type != "CAMERA":
-        return None
-    backgrounds = camera.data.background_images
-    return next((each.image for each in backgrounds if each.source == "IMAGE" and each.image is not None), None)
+        return []
+    return [each.image for each in camera.data.background_images if each.source == "IMAGE" and each.image is not None]
 
 
 def picture_view(context: bpy.types.Context, camera: bpy.types.Object, image: bpy.types.Image) -> View:

@@ -46,9 +46,11 @@ class Sheet:
     def __init__(self) -> None:
         self.variations: list[Variation] = []
         self.title = ""
+        self.of = 0
+        """Session uid of the human instead of whom they may be shown; 0 for none."""
         self._folder: Path | None = None
 
-    def fill(self, people: Sequence[VariationFiles], title: str) -> None:
+    def fill(self, people: Sequence[VariationFiles], title: str, of: int = 0) -> None:
         """Move the files of the child's `people` here, replacing those before. Raises OSError before any change."""
         folder = Path(tempfile.mkdtemp(prefix="variation_sheet_", dir=bpy.app.tempdir or None))
         made = []
@@ -65,13 +67,13 @@ class Sheet:
             remove_folder(folder, folder.parent)
             raise
         self.clear()
-        self.variations, self.title, self._folder = made, title, folder
+        self.variations, self.title, self.of, self._folder = made, title, of, folder
 
     def clear(self) -> None:
         """Remove all variations and their files."""
         if self._folder is not None:
             remove_folder(self._folder, self._folder.parent)
-        self.variations, self.title, self._folder = [], "", None
+        self.variations, self.title, self.of, self._folder = [], "", 0, None
 
     def chosen(self) -> list[Variation]:
         """The selected ones. Raises ValueError for none."""
@@ -81,8 +83,8 @@ class Sheet:
         return found
 
 
-sheet = Sheet()
-"""One, for all windows and scenes."""
+sheet, backs = Sheet(), Sheet()
+"""Those of Variations, and of the last human from a picture; for all windows and scenes."""
 
 PICTURE_PX = 256
 

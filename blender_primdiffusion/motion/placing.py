@@ -4,7 +4,6 @@ length of the path for other legs."""
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import bpy
 import numpy as np
@@ -155,10 +154,6 @@ def _legs(rest: NDArray) -> float:
     return float(sum(np.linalg.norm(rest[a] - rest[b]) for a, b in ends))
 
 
-FACTS = "primdiffusion_motion"
-"""Custom property of an action: what its motion is, as JSON."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Placement:
     """How a motion is to be put onto an armature."""
@@ -190,9 +185,7 @@ def place_motion(
     ratio = stride_ratio(motion, rest) if how.fit_stride else None
     fitted = fit(motion, rest, scene_fps(context.scene), how, 1.0 if ratio is None else ratio)
     frames = how.start + np.arange(len(fitted))
-    action = keyframe_poses(armature, frames, fitted.rotations, fitted.translations, motion.name)
-    action.use_fake_user = True
-    action[FACTS] = json.dumps({**facts(motion), "Stride": "as in the file" if ratio is None else f"x {ratio:.2f}"})
+    keyframe_poses(armature, frames, fitted.rotations, fitted.translations, motion.name).use_fake_user = True
     return float(frames[0]), float(frames[-1])
 
 
@@ -202,23 +195,6 @@ def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement, scale:
     if how.root != "KEEP":
         fitted = in_place(fitted) if how.root == "PLACE" else from_origin(fitted)
     return on_floor(fitted, rest) if how.ground else fitted
-
-
-def facts(motion: Motion) -> dict[str, str]:
-    """Facts about a motion for display, label to text."""
-    found = motion.detected
-    rate = f"{motion.fps:.4g}" + ("" if found.fps else " (assumed)")
-    bones = {"Bones": f"{len(found.bones)} of 24"} if found.bones else {}
-    people = {"People": f"{len(found.people)}: {', '.join(found.people[:6])}"} if len(found.people) > 1 else {}
-    return {
-        "Rig": found.rig or "unknown",
-        **people,
-        **bones,
-        "Up Axis": found.up + (" (uncertain)" if found.doubt else ""),
-        "Frames": f"{len(motion)} ({len(motion) / motion.fps:.1f} s)",
-        "Frame Rate": rate,
-        "Units": found.unit,
-    }
 
 
 def scene_fps(scene: bpy.types.Scene) -> float:

@@ -141,10 +141,9 @@ def write_model(
     kind: str,
     frames: range,
 ) -> None:
-    """Write a file of `kind` (GLB, FBX or USD), which appears whole or not at all; one frame is a pose.
+    """Write a file of `kind` (GLB or FBX), which appears whole or not at all; one frame is a pose.
 
-    USD's textures go into a folder beside the file, except in .usdz. Raises ValueError or RuntimeError where an
-    exporter is missing or fails, and OSError.
+    Raises ValueError or RuntimeError where an exporter is missing or fails, and OSError.
     """
     check_joints(armature)
     folder = Path(tempfile.mkdtemp(prefix="export_", dir=bpy.app.tempdir or None))
@@ -153,7 +152,8 @@ def write_model(
             _EXPORTERS[kind](folder / path.name, frames)
         if not (folder / path.name).is_file():
             raise RuntimeError(f"Blender's exporter wrote no {kind} file: see the console")
-        _publish(folder, path)
+        with replacing(path) as unfinished:
+            shutil.copyfile(folder / path.name, unfinished)
     finally:
         remove_folder(folder, folder.parent)
 
@@ -218,22 +218,7 @@ def _write_fbx(path: Path, frames: range) -> None:
         )
 
 
-def _write_usd(path: Path, frames: range) -> None:
-    if not bpy.app.build_options.usd:
-        raise ValueError("this Blender was built without USD: choose glTF or FBX")
-    _run(
-        bpy.ops.wm.usd_export,
-        filepath=str(path),
-        selected_objects_only=True,
-        export_animation=len(frames) > 1,
-        export_armatures=True,
-        only_deform_bones=True,
-        export_textures_mode="NEW",
-        export_materials=True,
-    )
-
-
-_EXPORTERS: dict[str, Callable[[Path, range], None]] = {"GLB": _write_glb, "FBX": _write_fbx, "USD": _write_usd}
+_EXPORTERS: dict[str, Callable[[Path, range], None]] = {"GLB": _write_glb, "FBX": _write_fbx}
 
 
 @contextmanager
@@ -253,12 +238,3 @@ def _run(exporter: Callable[..., set[str]], **settings: object) -> None:
     """Run an operator; raises RuntimeError, with Blender's own message, where it fails."""
     if exporter(**settings) != {"FINISHED"}:
         raise RuntimeError("Blender's exporter was cancelled: see the console")
-
-
-def _publish(folder: Path, path: Path) -> None:
-    """Copy the written files to their destination, the main file last. Raises OSError."""
-    for source in sorted(folder.rglob("*"), key=lambda source: source == folder / path.name):
-        if source.is_dir():
-            continue
-        with replacing(path.parent / source.relative_to(folder), path.parent) as unfinished:
-            shutil.copyfile(source, unfinished)

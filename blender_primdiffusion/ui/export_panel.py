@@ -69,14 +69,12 @@ FORMATS = (
     ("HUMAN", "Human File", "A .human file, which can be dropped into another scene", 3),
     ("GLB", "glTF", "A textured mesh in one .glb file: for game engines, web viewers and most other programs", 0),
     ("FBX", "FBX", "A textured mesh in one .fbx file", 1),
-    ("USD", "USD", "A textured mesh: a .usd file with its texture beside it, or one .usdz file", 2),
     ("PLY", "Gaussians", "3D Gaussians of the current pose in a .ply file, for splat viewers", 4),
 )
 ENDINGS = {
     "HUMAN": (".human", ".safetensors"),
     "GLB": (".glb",),
     "FBX": (".fbx",),
-    "USD": (".usdc", ".usda", ".usd", ".usdz"),
     "PLY": (".ply",),
 }
 """File extensions by format; the first is the default."""
@@ -85,7 +83,6 @@ OPTIONS = {
     "HUMAN": (),
     "GLB": _OF_MESHES,
     "FBX": _OF_MESHES,
-    "USD": _OF_MESHES,
     "PLY": ("gaussians",),
 }
 """Settings of each format."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 
 import bpy
@@ -12,8 +11,7 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 from ..backend.requests import sentence
 from ..formats.poses.files import ENDINGS, read_motion, write_amass
 from ..formats.poses.motion import Motion
-from ..motion.placing import FACTS, Placement, extend_range, place_motion, rounds_of, sample_motion, scene_fps
-from ..scene.blend_values import as_shown, stored_record
+from ..motion.placing import Placement, extend_range, place_motion, rounds_of, sample_motion, scene_fps
 from .drawing import draw_lines, property_columns
 from .export_panel import destination
 from .on_person import ArmatureOperator, WhereTo, target_armature, warn_of_rest
@@ -85,7 +83,8 @@ class PRIMDIFFUSION_OT_import_motion(ArmatureOperator, WhereTo, ImportHelper, bp
         warn_of_rest(self, armature)
         if motion.detected.doubt:
             self.report({"WARNING"}, motion.detected.doubt)
-        self.report({"INFO"}, f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}")
+        found = f"{motion.detected.rig or 'unknown rig'}, {motion.detected.up} up, {motion.fps:.4g} fps"
+        self.report({"INFO"}, f"{motion.name} ({found}): {len(motion)} frames on frames {first:g} to {last:g}")
         return {"FINISHED"}
 
     def axis(self) -> str:
@@ -111,7 +110,6 @@ class PRIMDIFFUSION_FH_motion(bpy.types.FileHandler):
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
-_MOST_FACTS = 20
 _BUILT_IN = [
     ("WALK", "Walk", "An easy walk straight ahead; the feet do not slide"),
     ("IDLE", "Idle", "Standing, breathing, the weight going from leg to leg"),
@@ -196,17 +194,5 @@ def _draw_action(layout: bpy.types.UILayout, armature: bpy.types.Object) -> None
         row.context_pointer_set("animated_id", armature)
         # without an action, the menu is an icon alone
         row.template_action(armature, unlink="action.unlink", text="" if action else "Action")
-    if action is None:
-        return
-    start, end = action.frame_range
-    box = layout.box().column(align=True)
-    for label, text in {**facts_of(action), "In the Scene": f"{start:g} \N{EN DASH} {end:g}"}.items():
-        row = box.split(factor=0.4)
-        row.label(text=label)
-        row.label(text=text, translate=False)
-
-
-def facts_of(action: bpy.types.Action) -> dict[str, str]:
-    """What was found when the motion was imported; nothing for actions of other origin."""
-    found = itertools.islice(stored_record(action, FACTS).items(), _MOST_FACTS)
-    return {as_shown(name): as_shown(value) for name, value in found}
+    if action is not None:
+        layout.label(text="Frames {:g} \N{EN DASH} {:g}".format(*action.frame_range), translate=False)

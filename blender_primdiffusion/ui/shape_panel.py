@@ -10,9 +10,8 @@ import numpy as np
 
 from ..backend.requests import sentence
 from ..files.regular_files import printable
-from ..scene.actions import action_curves
 from ..scene.edit import check_shapeable, reshape
-from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, is_human, selected_person
+from ..scene.human import BETA_COUNT, LARGEST_BETA, is_human, selected_person
 from ..scene.human_file import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
@@ -146,13 +145,6 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
 
     to: bpy.props.EnumProperty(name="Reshape To", description="Which shape", items=_SHAPES, options=SKIP)
     seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another body", min=0, options=SKIP)
-    spread: bpy.props.FloatProperty(
-        name="Spread",
-        description="How far bodies differ from the mean body: 1 as real people do",
-        default=1.0,
-        min=0.0,
-        max=2.0,
-    )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.to == "RANDOM" and not self.given("seed"):
@@ -161,19 +153,16 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
-        for name in ("to", "seed", "spread") if self.to == "RANDOM" else ("to",):
+        for name in ("to", "seed") if self.to == "RANDOM" else ("to",):
             layout.prop(self, name)
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
+        drawn = np.random.default_rng(self.seed).normal(size=BETA_COUNT)
         random_betas = np.clip(drawn, -_FARTHEST, _FARTHEST)
         warning = reshape(person, random_betas if self.to == "RANDOM" else generated_betas(person))
         if warning:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
-
-
-_ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
 
 
 def draw_shape(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -192,8 +181,6 @@ def draw_shape(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row = layout.row(align=True)
     row.operator("primdiffusion.reshape", text="Random", icon="FILE_REFRESH").to = "RANDOM"
     row.operator("primdiffusion.reshape", text="Reset", icon="LOOP_BACK").to = "GENERATED"
-    if _animated(person):
-        draw_lines(layout, _ANIMATED, "INFO")
     if (body := draw_section(layout, "more_sliders", text="More Sliders")) is not None:
         _draw_sliders(body, settings, {index: name for index, name in enumerate(names) if name.isdecimal()})
 
@@ -203,14 +190,6 @@ def _draw_sliders(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup,
     column = layout.column(align=True) if names else layout  # an empty column leaves a gap
     for index, name in names.items():
         column.prop(settings, "betas", index=index, text=name, slider=True)
-
-
-def _animated(armature: bpy.types.Object) -> bool:
-    """Whether keys or drivers move the betas."""
-    if armature.animation_data is None:
-        return False
-    curves = (*armature.animation_data.drivers, *(action_curves(armature) or ()))
-    return any(curve.data_path == f'["{BETAS}"]' for curve in curves)
 
 
 PROPERTIES = ((bpy.types.Object, "primdiffusion_human", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_human)),)

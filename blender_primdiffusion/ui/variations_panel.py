@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
@@ -13,7 +13,7 @@ from ..backend.requests import sentence
 from ..formats.requests import VariationsRequest
 from ..jobs.follow import Reporting, submit
 from ..jobs.queue import queue
-from ..jobs.variations import Variation, VariationsJob, sheet
+from ..jobs.variations import Sheet, Variation, VariationsJob, backs, sheet
 from ..jobs.windows import icons
 from ..scene.build import build_human
 from ..scene.place import stand_at_cursor
@@ -155,7 +155,7 @@ def draw_variations(layout: bpy.types.UILayout, context: bpy.types.Context) -> N
     if job is not None and job.kind == "variations":
         _draw_progress(layout, _columns(context), job)
     elif sheet.variations:
-        _draw_sheet(layout, _columns(context))
+        _draw_sheet(layout, context)
         _draw_choice(layout, settings)
 
 
@@ -182,12 +182,19 @@ def _draw_progress(layout: bpy.types.UILayout, columns: tuple[int, float], job: 
         cell.label(text=str(seed))
 
 
-def _draw_sheet(layout: bpy.types.UILayout, columns: tuple[int, float]) -> None:
-    layout.label(text=f"{sheet.title}: {len(sheet.variations)}", translate=False)
-    grid = _grid(layout, columns[0])
-    for index, variation in enumerate(sheet.variations):
+def draw_people(layout: bpy.types.UILayout, context: bpy.types.Context, people: Sheet) -> Iterator[tuple]:
+    """Draw the pictures of a sheet; yields the index of each, its human, and the cell for the button below it."""
+    columns, units = _columns(context)
+    grid = _grid(layout, columns)
+    for index, variation in enumerate(people.variations):
         cell = grid.column(align=True)
-        _draw_picture(cell, variation.picture, columns[1])
+        _draw_picture(cell, variation.picture, units)
+        yield index, variation, cell
+
+
+def _draw_sheet(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    layout.label(text=f"{sheet.title}: {len(sheet.variations)}", translate=False)
+    for index, variation, cell in draw_people(layout, context, sheet):
         icon = "CHECKBOX_HLT" if variation.chosen else "CHECKBOX_DEHLT"
         manager = bpy.context.window_manager
         cell.prop(manager, "primdiffusion_selected", index=index, text=str(variation.seed), icon=icon, toggle=True)
@@ -214,6 +221,7 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
 def clear_before_loading(*_: object) -> None:
     """Handler of load_pre: the sheet belongs to the file that is being closed."""
     sheet.clear()
+    backs.clear()
     icons.free()
 
 

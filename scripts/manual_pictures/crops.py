@@ -22,6 +22,7 @@ PANELS = {
     "render": ("render_cycles", "render_merged", "render_outdated"),
     "captures": ("captures_settings",),
     "export": ("export_before", "export_proxy"),
+    "picture": ("picture_chosen", "picture_another_back"),
 }
 """Rows of sidebars, cropped to their panels."""
 WINDOWS = {

@@ -204,7 +204,7 @@ def edits(module: str, python: str) -> Steps:
     paint(first)
     _, area = view()
     area.spaces.active.shading.type = "SOLID"
-    yield 2.0
+    yield from at_rest(module)
     yield "edit_painting"
     press("primdiffusion.paint_region", finish=True)
     settings.region = "PARTS"

@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
-from blender_primdiffusion.motion.placing import FACTS
 from blender_primdiffusion.places import EXTENSION
 from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, volume_nodes
 from blender_primdiffusion.scene.build import build_human
@@ -145,7 +144,6 @@ HOLDERS: dict[str, Callable[[], Any]] = {
     volume_nodes.VOLUMES_MARK: _with(volume_nodes.VOLUMES_MARK),
     splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
     splats.CELLS_MARK: _with(splats.CELLS_MARK),
-    FACTS: lambda: bpy.data.actions["Walk"],
 }
 """What holds each custom property."""
 SETTINGS = {

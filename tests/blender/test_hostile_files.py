@@ -126,6 +126,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("addon")
 def test_every_operator_with_a_path_gets_hostile_files():
     expected = {name.partition(" ")[0]: {shown} for name, (shown, _) in READS.items()}
+    expected["choose_picture"] |= {"directory"}  # of several, as `filepath` each
     assert with_paths() == expected | {name: {"filepath"} for name, _ in WRITES}
 
 

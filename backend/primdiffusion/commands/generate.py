@@ -18,6 +18,7 @@ from primdiffusion.commands.output import (
     draw_front_and_back,
     skips_previews,
     step_previews,
+    variation_files,
     write_files,
     write_human,
 )
@@ -30,7 +31,7 @@ from primdiffusion.editing.edit import with_payload
 from primdiffusion.editing.vary import vary_batch
 from primdiffusion.files.regular_files import check_unlinked
 from primdiffusion.files.whole_files import staged
-from primdiffusion.formats.answers import HumanAnswer, VariationFiles, VariationsAnswer
+from primdiffusion.formats.answers import HumanAnswer, VariationsAnswer
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
 from primdiffusion.human import Human, generate_batch, people_of
 from primdiffusion.human_file import load_human
@@ -118,25 +119,17 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
         model = session.model(request.checkpoint)
         report("sample", 0, request.steps, None)
         for index, human in enumerate(_sample_variations(model, request, folder, report)):
-            files = _files(folder, request.seeds[index])
+            files = variation_files(folder, request.seeds[index])
             write_files(files.person, human)
             draw_front_and_back(files.picture, human, request.size)
             report("write", index + 1, len(request.seeds), None, picture=files.picture, index=index)
             made = human.provenance if request.person is None else human.provenance["edits"][-1]
             warnings += [f"seed {request.seeds[index]}: {warning}" for warning in warnings_of(made)]
     return VariationsAnswer(
-        people=[_files(request.out_dir, seed) for seed in request.seeds],
+        people=[variation_files(request.out_dir, seed) for seed in request.seeds],
         warnings=warnings,
         seconds=round(time.perf_counter() - began, 3),
         peak_gb=round(peak_memory_gb(), 3),
-    )
-
-
-def _files(folder: Path, seed: int) -> VariationFiles:
-    return VariationFiles(
-        seed=seed,
-        person=folder / f"{seed}.human.safetensors",
-        picture=folder / f"{seed}.png",
     )
 
 

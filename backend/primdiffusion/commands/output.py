@@ -25,6 +25,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.files.regular_files import remove_file
+from primdiffusion.formats.answers import VariationFiles
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import Compositing
 from primdiffusion.geometry.camera import Camera
@@ -100,6 +101,11 @@ def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
     save_human(path, human, compact=compact)
     if human.body_setup is not None:
         save_body(path.with_name(FILES.body), human.body_setup.body, human.body_setup.anchors)
+
+
+def variation_files(folder: Path, seed: int) -> VariationFiles:
+    """The files of one of several humans."""
+    return VariationFiles(seed=seed, person=folder / f"{seed}.human.safetensors", picture=folder / f"{seed}.png")
 
 
 _compiler: list[BaseProcess] = []
@@ -244,11 +250,20 @@ def draw_front(path: Path, human: Human, px: int, compositing: Compositing = "li
     draw(path, primitives, framing(primitives, 0, px, px), None, compositing)
 
 
+def draw_back(path: Path, human: Human, px: int) -> None:
+    """Draw the human as `draw_front_and_back` does, twice from behind: to the left and to the right."""
+    _draw_side_by_side(path, human, px, (180 - THREE_QUARTERS, 180 + THREE_QUARTERS))
+
+
 def draw_front_and_back(path: Path, human: Human, px: int) -> None:
     """Draw the human with lowered arms, front and back side by side, px x px pixels with a transparent background."""
+    _draw_side_by_side(path, human, px, (THREE_QUARTERS, THREE_QUARTERS + 180))
+
+
+def _draw_side_by_side(path: Path, human: Human, px: int, angles: tuple[float, float]) -> None:
     primitives = place(human, a_pose())
     views = []
-    for degrees in (THREE_QUARTERS, THREE_QUARTERS + 180):
+    for degrees in angles:
         view = march(primitives, framing(primitives, degrees, px // 2, px))
         views.append(torch.cat([view.rgb, view.alpha[..., None]], dim=-1))
     rgba_to_png(path, torch.cat(views, dim=1), None)

@@ -6,10 +6,11 @@ import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from PIL import Image
 from torch import Tensor
 
@@ -22,18 +23,20 @@ from primdiffusion.capture.conditioning import (
 )
 from primdiffusion.capture.reader import Captures
 from primdiffusion.commands.options import RefineCommand
-from primdiffusion.commands.output import FILES, write_human
+from primdiffusion.commands.output import FILES, draw_back, variation_files, write_files, write_human
 from primdiffusion.commands.progress import ReportProgress, print_warnings
 from primdiffusion.commands.session import Session
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.files.whole_files import staged
-from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
+from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer, VariationFiles
 from primdiffusion.formats.requests import FitPostureRequest, Pictures, ReconstructRequest
-from primdiffusion.human import Human
+from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.human_file import load_human
+from primdiffusion.reconstruction.from_captures import FIT_STEPS, PriorFit, steps_of
 from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
-from primdiffusion.reconstruction.from_captures import steps_of
 from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
+from primdiffusion.reconstruction.posture_fit import each
 from primdiffusion.reconstruction.posture_start import write_posture
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.machine import peak_memory_gb
@@ -43,6 +46,10 @@ STAGES = 4
 """Load, read, encode, write."""
 ENCODER_VIEWS = 8
 """Images to encode for a start from the encoder."""
+START_WORK, FIT_WORK = 6, 20
+"""Work of a step of `PriorFit.start` and of `PriorFit.fit`; that of a step of the posture is 1."""
+SURE_AFTER_S = 3.0
+"""Seconds until the time left is told; the first steps compile."""
 POSTURE_FILE, MASK_FILE = "posture.json", "mask.png"
 
 
@@ -57,23 +64,30 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         report("load", 0, STAGES, None)
         by_encoder = request.capture is not None and request.by == "encoder"
         model = session.encoder(request.checkpoint) if by_encoder else session.model(request.checkpoint)
-        on_step = _steps(report, steps_of(model) + (POSTURE_STEPS if request.pictures and request.refine else 0))
-        report("read", 1, STAGES, None)
+        on_step = _steps(report, request.refine and bool(request.pictures), steps_of(model), 1 + request.backs)
         if request.capture is None:
+            report("read", 0, STAGES, None)
             model = session.model(request.checkpoint)
             person = person_in_pictures(model, *_files(request), refine=request.refine, on_step=on_step)
             _write_found(folder, person)
-            if len(request.pictures) == 1:
+            if len(request.pictures) == 1 and not request.backs:
                 warnings.append("only one picture: the sides that it does not show are guessed")
         else:
+            report("read", 1, STAGES, None)
             body = model.body if isinstance(model, EncoderModel) else None
             person = captured_person(request.capture, request.subject, request.frame, request.views, body)
-        report("encode", 2, STAGES, None)
-        found = time.perf_counter()
-        human = reconstruct_human(model, person, request.seed, on_step)
+            report("encode", 2, STAGES, None)
+        found, backs = time.perf_counter(), _backs(request, folder)
+        if backs and isinstance(model, DiffusionModel):
+            human, *others = _drawn(model, person, (request.seed, *(back.seed for back in backs)), on_step)
+        else:
+            human, others = reconstruct_human(model, person, request.seed, on_step), []
         encoded = time.perf_counter()
-        report("write", 3, STAGES, None)
+        report("write", STAGES if request.pictures else 3, STAGES, None)
         write_human(folder, human, request.size)
+        for files, other in zip(backs, others, strict=True):
+            write_files(files.person, other)
+            draw_back(files.picture, other, request.size)
         report("write", STAGES, STAGES, 0.0)  # the last chance to cancel
     of_capture = {} if person.frame is None else {"subject": person.subject, "views": list(person.cameras)}
     return ReconstructAnswer(
@@ -82,12 +96,32 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         frame=person.frame,
         posture=None if request.capture else request.out_dir / POSTURE_FILE,
         fit=None if person.fit is None else person.fit["percent"],
+        backs=_backs(request, request.out_dir),
         seed=request.seed,
         warnings=[*warnings, *person.warnings],
         seconds=round(time.perf_counter() - began, 3),
         seconds_encoding=round(encoded - found, 3),
         peak_gb=round(peak_memory_gb(), 3),
     )
+
+
+def _backs(request: ReconstructRequest, folder: Path) -> list[VariationFiles]:
+    first = 0 if request.seed is None else request.seed + 1
+    return [variation_files(folder, seed) for seed in range(first, first + request.backs)]
+
+
+def _drawn(
+    model: DiffusionModel, person: CapturedPerson, seeds: Sequence[int | None], on_step: Callable[[], None]
+) -> Iterator[Human]:
+    """As `reconstruct_human` for each seed. What takes longest, the search for outfit and hair, is done once."""
+    components, views = PriorFit.of(model), person.views
+    frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
+    explanation = components.start(views, frames, on_step)
+    for seed in seeds:
+        origin: dict[str, Any] = {"reconstructed_from": person.subject, **({} if seed is None else {"seed": seed})}
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        payload = components.fit(views, frames, explanation, on_step, generator)
+        yield Human(payload, person.betas, {**origin, **made_by(model)}).validate()
 
 
 def fit_posture(request: FitPostureRequest, session: Session, report: ReportProgress) -> FitPostureAnswer:
@@ -97,7 +131,7 @@ def fit_posture(request: FitPostureRequest, session: Session, report: ReportProg
         report("load", 0, 1, None)
         model = session.model(request.checkpoint)
         report("read", 0, 1, None)
-        person = person_in_pictures(model, *_files(request), on_step=_steps(report, POSTURE_STEPS))
+        person = person_in_pictures(model, *_files(request), on_step=_steps(report, True))
         _write_found(folder, person)
     seconds, warnings = round(time.perf_counter() - began, 3), list(person.warnings)
     fit = None if person.fit is None else person.fit["percent"]
@@ -176,6 +210,18 @@ def _files(request: Pictures) -> tuple[Any, ...]:
     return request.pictures, request.masks, request.mask_label, request.pose, request.cameras
 
 
-def _steps(report: ReportProgress, total: int) -> Callable[[], None]:
-    done = itertools.count(1)
-    return lambda: report("fit", next(done), total, None)
+def _steps(report: ReportProgress, posture: bool, others: int = 0, humans: int = 0) -> Callable[[], None]:
+    """Return a function to call after each step, which reports the work done and the seconds left.
+
+    `others`: `steps_of` the model, of which FIT_STEPS are repeated for each of the `humans`.
+    """
+    work = [1] * (POSTURE_STEPS if posture else 0)
+    work += [START_WORK] * (others - FIT_STEPS) + [FIT_WORK] * (FIT_STEPS * humans if others else 0)
+    done, began = itertools.accumulate(work), time.perf_counter()
+
+    def on_step() -> None:
+        so_far, spent = next(done), time.perf_counter() - began
+        left = spent / so_far * (sum(work) - so_far)
+        report("fit", so_far, sum(work), round(left, 3) if spent > SURE_AFTER_S else None)
+
+    return on_step

@@ -45,6 +45,15 @@ class HumanAnswer(Open):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class VariationFiles(Open):
+    """One of several humans."""
+
+    seed: Count
+    person: Path
+    picture: Path
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ReconstructAnswer(HumanAnswer):
     """A reconstructed human."""
 
@@ -57,6 +66,8 @@ class ReconstructAnswer(HumanAnswer):
     """posture.json: pose, shape and cameras in pictures; None for captures."""
     fit: Percent | None = None
     """How well the body in that posture explains the pictures; None for captures."""
+    backs: list[VariationFiles] = dataclasses.field(default_factory=list)
+    """Further humans of the same pictures, seen from behind."""
 
     def __str__(self) -> str:
         """As the command line prints it."""
@@ -78,15 +89,6 @@ class FitPostureAnswer(Open):
     """Sentences."""
     fit: Percent | None = None
     """How well the body in that posture explains the pictures."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VariationFiles(Open):
-    """One of several humans."""
-
-    seed: Count
-    person: Path
-    picture: Path
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -274,6 +274,9 @@ class ReconstructRequest(Previews, Pictures):
     """Whether pose, shape and cameras of pictures are refined; otherwise a pose file and cameras are needed."""
     seed: Seed | None = None
     """Draws what no picture shows; without it, that is the most probable."""
+    backs: Annotated[int, Range(0, 16)] = 0
+    """Number of further humans of the same pictures to choose from: SEED.human.safetensors, and SEED.png from behind.
+    They draw what no picture shows by the seeds after `seed`, or from 0 on."""
     capture: Path | None = None
     """Folder of a capture dataset, or of one subject in it."""
     subject: str | None = None
@@ -295,6 +298,10 @@ class ReconstructRequest(Previews, Pictures):
             raise FieldError(("capture",), "and pictures exclude each other: give a folder of captures, or pictures")
         if self.seed is not None and not self.pictures and self.by != "prior":
             raise FieldError(("seed",), "has no effect on the encoder: leave it out, or reconstruct by prior")
+        if self.backs and not self.pictures:
+            raise FieldError(("backs",), f"is {self.backs}, but only pictures have backs to choose from: leave it out")
+        if (self.seed or 0) + self.backs > LARGEST_SEED:
+            raise FieldError(("backs",), f"is {self.backs}: the last seed would be above 2^63 - 1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,10 @@ import torch
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
+from primdiffusion.commands import reconstruct as commands
 from primdiffusion.commands.reconstruct import fit_posture
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import FitPostureRequest
+from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human
@@ -105,6 +106,33 @@ def test_seeds_vary_the_human_and_repeat(line, tmp_path):
         payloads.append(human.payload.rgb)
     assert not torch.equal(payloads[0], payloads[1])
     assert torch.equal(payloads[0], payloads[2])
+
+
+def test_backs_to_choose_from_are_the_humans_of_their_seeds(line, tmp_path):
+    cli.main([*line, "--backs", "2"])
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    backs = ["0.human.safetensors", "0.png", "1.human.safetensors", "1.png"]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, *backs])
+    for name, more in {"person": [], "0": ["--seed", "0"], "1": ["--seed", "1"]}.items():
+        cli.main([*line, *more, "--out", str(alone)])
+        one, other = (load_human(path / f"{end}.human.safetensors") for path, end in ((out, name), (alone, "person")))
+        assert torch.equal(one.payload.rgb, other.payload.rgb)
+        assert one.provenance == other.provenance
+    assert Image.open(out / "1.png").size == (32, 32)
+
+
+def test_progress_never_goes_back_and_says_how_long_it_takes(picture, checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr(commands, "SURE_AFTER_S", 0.0)
+    monkeypatch.setattr(commands, "POSTURE_STEPS", 9)  # those of `short`
+    request = ReconstructRequest(pictures=(picture,), out_dir=tmp_path, checkpoint=checkpoint, size=32, backs=1)
+    told = []
+    commands.reconstruct(request, Session(), lambda *about, **_: told.append(about))
+    shares = [step / total for _, step, total, _ in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+    left = [about[3] for about in told if about[0] == "fit"]
+    assert all(seconds > 0 for seconds in left[:-1])
+    assert left[-1] == 0
 
 
 def test_two_pictures_have_a_pose_and_a_camera_each(line, picture, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from blender_primdiffusion.formats.poses.motion import Detected, Motion
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, joint_positions
 
 from blender_primdiffusion.motion.placing import (
-    FACTS,
     Placement,
     place_motion,
     resample,
@@ -105,8 +103,8 @@ def test_a_fast_camera_that_trembles_by_a_millimetre_gives_nearly_the_same():
     assert stride_ratio(shaken, longer_legs(1.15)) == pytest.approx(1.15, abs=0.04)
 
 
-@pytest.mark.parametrize(("fit_stride", "way", "fact"), [(True, 1.15, "x 1.1"), (False, 1.0, "as in the file")])
-def test_an_amass_walk_on_longer_legs_goes_as_far_as_they_step(saved_scene, tmp_path, walk, fit_stride, way, fact):
+@pytest.mark.parametrize(("fit_stride", "way"), [(True, 1.15), (False, 1.0)])
+def test_an_amass_walk_on_longer_legs_goes_as_far_as_they_step(saved_scene, tmp_path, walk, fit_stride, way):
     write_amass(tmp_path / "walk.npz", walk, np.zeros(10))
     armature = build_armature("long", points_to_blender(longer_legs(1.15)))
     saved_scene.scene.collection.objects.link(armature)
@@ -117,4 +115,3 @@ def test_an_amass_walk_on_longer_legs_goes_as_far_as_they_step(saved_scene, tmp_
         saved_scene.scene.frame_set(frame)
         ends.append(np.array(armature.pose.bones["pelvis"].head))
     assert np.linalg.norm((ends[1] - ends[0])[:2]) == pytest.approx(way * STEPS / 2 * 1.28, rel=0.03)
-    assert json.loads(armature.animation_data.action[FACTS])["Stride"].startswith(fact)

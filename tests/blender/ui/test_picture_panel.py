@@ -12,10 +12,11 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
 
-from blender_primdiffusion.capture.cameras import OpenImageIO, picture_of, picture_view, stored_turned
+from blender_primdiffusion.capture.cameras import OpenImageIO, picture_view, pictures_of, stored_turned
 from blender_primdiffusion.jobs import from_picture
 from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.variations import backs
 from blender_primdiffusion.motion.poses import take_world_posture, world_posture
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import humans
@@ -51,7 +52,7 @@ def a_human() -> bpy.types.Object:
 def focal_length(context) -> float:
     """Of the scene's camera, pixels."""
     camera = context.scene.camera
-    return picture_view(context, camera, picture_of(camera)).intrinsics[0, 0]
+    return picture_view(context, camera, pictures_of(camera)[0]).intrinsics[0, 0]
 
 
 def joint_places(armature) -> np.ndarray:
@@ -62,7 +63,7 @@ def joint_places(armature) -> np.ndarray:
 
 def test_a_picture_becomes_the_background_of_a_camera_of_its_size(chosen, picture):
     camera = chosen.scene.camera
-    image = picture_of(camera)
+    image = pictures_of(camera)[0]
     assert Path(bpy.path.abspath(image.filepath)) == picture
     render = chosen.scene.render
     assert (render.resolution_x, render.resolution_y, render.resolution_percentage) == (WIDTH, HEIGHT, 100)
@@ -143,13 +144,14 @@ def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, pictu
     mask = tmp_path / "mask.png"
     write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
     settings = chosen.scene.primdiffusion_picture
-    settings.mask, settings.seed = str(mask), 5
+    settings.mask, settings.backs = str(mask), 0
     camera = chosen.scene.camera
     before = np.array(camera.matrix_world.translation)
     assert bpy.ops.primdiffusion.human_from_picture() == {"FINISHED"}
     (person,) = humans(chosen.scene)
     sent = request_of(person_file(person))
-    assert (sent["pictures"], sent["masks"], sent["seed"]) == ([str(picture)], [str(mask)], 5)
+    assert (sent["pictures"], sent["masks"]) == ([str(picture)], [str(mask)])
+    assert "backs" not in sent
     assert Path(sent["cameras"]).name == "cameras.json"
     assert "pose" not in sent
     armature = person
@@ -168,6 +170,98 @@ def test_make_human_stands_where_the_posed_one_was_which_is_hidden(chosen):
     assert posed.hide_viewport
     assert posed.hide_render
     assert world_posture(made)[1] == pytest.approx(world_posture(posed)[1] + MOVED, abs=0.02)
+
+
+def test_one_of_the_backs_is_shown_in_place_and_undone_in_one_step(chosen):
+    chosen.scene.primdiffusion_picture.backs = 3
+    a_human().select_set(False)
+    bpy.ops.primdiffusion.human_from_picture()
+    person = bpy.context.view_layer.objects.active
+    name = person.name
+    assert request_of(person_file(person))["backs"] == 3
+    texts = shown(PRIMDIFFUSION_PT_human_from_picture, chosen)
+    assert texts[texts.index("Other backs") + 1 :] == ["primdiffusion.human_from_picture"] * 3
+    before, files = person_file(person).read_bytes(), [one.person.read_bytes() for one in backs.variations]
+    bpy.ops.ed.undo_push(message="before")
+    pose, translation = world_posture(person)
+    assert bpy.ops.primdiffusion.human_from_picture(back=2) == {"FINISHED"}
+    person = bpy.data.objects[name]
+    assert person_file(person).read_bytes() == files[1] != before
+    after = world_posture(person)
+    assert after[0] == pytest.approx(pose, abs=1e-5)
+    assert after[1] == pytest.approx(translation, abs=1e-5)
+    bpy.ops.ed.undo()
+    assert person_file(bpy.data.objects[name]).read_bytes() == before
+    with refused(RuntimeError, "no such back"):
+        bpy.ops.primdiffusion.human_from_picture(back=4)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    assert not backs.variations
+    with refused(RuntimeError, "no such back"):
+        bpy.ops.primdiffusion.human_from_picture(back=1)
+
+
+@pytest.fixture
+def three(chosen, picture):
+    """Three pictures chosen at once, as in the file browser."""
+    for name in ("side.png", "back.png"):
+        write_png(picture.with_name(name), np.full((HEIGHT, WIDTH, 4), 90, np.uint8))
+    names = [{"name": name} for name in ("anna.png", "side.png", "back.png")]
+    assert bpy.ops.primdiffusion.choose_picture(directory=str(picture.parent), files=names) == {"FINISHED"}
+    return chosen
+
+
+def test_several_pictures_have_one_camera_and_a_pose_each(three, picture):
+    images = pictures_of(three.scene.camera)
+    assert [Path(image.filepath).name for image in images] == ["anna.png", "side.png", "back.png"]
+    backgrounds = three.scene.camera.data.background_images
+    assert [each.show_background_image for each in backgrounds] == [True, False, False]
+    three.scene.primdiffusion_picture.mask = str(picture)
+    bpy.ops.primdiffusion.human_from_picture()
+    (person,) = humans(three.scene)
+    sent = request_of(person_file(person))
+    assert [Path(path).name for path in sent["pictures"]] == ["anna.png", "side.png", "back.png"]
+    assert not {"cameras", "pose", "masks"} & set(sent)
+    assert world_posture(person)[0][LEFT_SHOULDER, 2] == pytest.approx(-0.5, abs=1e-5)
+    three.scene.frame_set(2)
+    assert world_posture(person)[0][LEFT_SHOULDER, 2] == pytest.approx(0, abs=1e-5)
+    shoulder = person.pose.bones["left_shoulder"]
+    shoulder.rotation_quaternion = (np.cos(0.3), 0, 0, np.sin(0.3))
+    shoulder.keyframe_insert("rotation_quaternion", frame=2)
+    wanted = world_posture(person)[0][LEFT_SHOULDER]
+    bpy.ops.primdiffusion.human_from_picture(human=person.name)
+    made = next(one for one in humans(three.scene) if one != person)
+    assert Path(request_of(person_file(made))["pose"]).suffix == ".npz"
+    three.scene.frame_set(2)
+    assert world_posture(made)[0][LEFT_SHOULDER] == pytest.approx(wanted, abs=1e-4)
+
+
+def test_too_many_pictures_and_a_damaged_one_leave_nothing(addon, picture):
+    (picture.parent / "noise.png").write_bytes(b"no picture")
+    names = [{"name": name} for name in ("anna.png", "noise.png")]
+    with refused(RuntimeError, "noise.png"):
+        bpy.ops.primdiffusion.choose_picture(directory=str(picture.parent), files=names)
+    with refused(RuntimeError, "9 pictures", "up to 8"):
+        bpy.ops.primdiffusion.choose_picture(directory=str(picture.parent), files=[{"name": "anna.png"}] * 9)
+    assert not bpy.data.images
+    assert not bpy.data.cameras
+
+
+def test_a_human_with_lowered_arms_is_added_to_a_picture_without_alpha(addon, tmp_path, picture):
+    write_png(tmp_path / "plain.png", np.full((HEIGHT, WIDTH, 3), 200, np.uint8))
+    addon.scene.primdiffusion_picture.mask = str(picture)
+    bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "plain.png"))
+    assert not humans(addon.scene), "the mask marks the person"
+    addon.scene.primdiffusion_picture.mask = ""
+    for _ in range(2):
+        bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "plain.png"))
+    (person,) = humans(addon.scene)
+    assert bpy.context.view_layer.objects.active == person
+    bpy.context.view_layer.update()
+    wrist = joint_places(person)[1]
+    view = picture_view(addon, addon.scene.camera, pictures_of(addon.scene.camera)[0])
+    pixels, _ = view.project(joint_places(person))
+    assert ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(), "the human is in the picture"
+    assert wrist[1] < joint_places(person)[0][1] + 0.2
 
 
 def test_without_picture_human_or_equal_size_there_is_a_sentence(addon, picture):
@@ -227,7 +321,7 @@ def test_the_real_child_makes_a_human_of_a_picture(real_child, tmp_path):
     bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "anna.png"))
     assert bpy.ops.primdiffusion.human_from_picture() == {"FINISHED"}
     (person,) = humans(real_child.scene)
-    view = picture_view(real_child, real_child.scene.camera, picture_of(real_child.scene.camera))
+    view = picture_view(real_child, real_child.scene.camera, pictures_of(real_child.scene.camera)[0])
     pixels, depth = view.project(joint_places(person))
     assert (depth > 1).all()
     assert ((pixels > 5) & (pixels < [75, 115])).all()

@@ -164,11 +164,29 @@ def posture(params: dict) -> dict:
     """What was given, or a T pose, with the left arm down, the pelvis moved, and a lens a tenth longer."""
     path = Path(params["out_dir"]) / "posture.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    if "pose" in params:
+    count = len(params["pictures"])
+    if "pose" in params and count == 1:
         found = json.loads(Path(params["pose"]).read_text())
     else:
-        cameras = json.loads(Path(params["cameras"]).read_text())
-        found = {"pose": [[0.0] * 72], "translation": [[0.0] * 3], "betas": [0.0] * 10, "cameras": cameras}
+        view = {
+            "K": [[80.0, 0, 30], [0, 80.0, 40], [0, 0, 1]],
+            "R": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+            "T": [0, 1, 4],
+        }
+        cameras = {"camera0000": view}
+        if "cameras" in params:
+            cameras = json.loads(Path(params["cameras"]).read_text())
+        found = {
+            "pose": [[0.0] * 72 for _ in range(count)],
+            "translation": [[0.0] * 3],
+            "betas": [0.0] * 10,
+            "cameras": cameras,
+        }
+    if count > 1 and "pose" in params:
+        import numpy as np
+
+        with np.load(params["pose"]) as poses:
+            found["pose"] = poses["poses"].tolist()
     found["pose"][0][3 * 16 + 2] -= 0.5
     found["translation"][0][0] += 0.25
     found["betas"][1] += 0.5
@@ -180,7 +198,12 @@ def posture(params: dict) -> dict:
 
 
 def reconstructed(params: dict) -> dict:
-    return human(params) | (posture(params) if "pictures" in params else {})
+    """Backs differ in colour."""
+    made = human(params) | (posture(params) if "pictures" in params else {})
+    backs = sheet({**params, "person": "", "seeds": list(range(params.get("backs", 0)))})["people"]
+    for back in backs:
+        shutil.copyfile(HERE / "picture.png", back["picture"])
+    return {**made, "backs": backs}
 
 
 def picture(params: dict) -> dict:
