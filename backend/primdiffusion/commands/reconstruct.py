@@ -6,11 +6,10 @@ import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from PIL import Image
 from torch import Tensor
 
@@ -31,12 +30,11 @@ from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer, VariationFiles
 from primdiffusion.formats.requests import FitPostureRequest, Pictures, ReconstructRequest
-from primdiffusion.human import Human, default_frames, made_by
+from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
-from primdiffusion.reconstruction.from_captures import FIT_STEPS, PriorFit, steps_of
+from primdiffusion.reconstruction.from_captures import FIT_STEPS, draw_humans, steps_of
 from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
 from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
-from primdiffusion.reconstruction.posture_fit import each
 from primdiffusion.reconstruction.posture_start import write_posture
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.machine import peak_memory_gb
@@ -46,7 +44,7 @@ STAGES = 4
 """Load, read, encode, write."""
 ENCODER_VIEWS = 8
 """Images to encode for a start from the encoder."""
-START_WORK, FIT_WORK = 6, 20
+START_WORK, FIT_WORK = 4, 15
 """Work of a step of `PriorFit.start` and of `PriorFit.fit`; that of a step of the posture is 1."""
 SURE_AFTER_S = 3.0
 """Seconds until the time left is told; the first steps compile."""
@@ -79,7 +77,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
             report("encode", 2, STAGES, None)
         found, backs = time.perf_counter(), _backs(request, folder)
         if backs and isinstance(model, DiffusionModel):
-            human, *others = _drawn(model, person, (request.seed, *(back.seed for back in backs)), on_step)
+            human, *others = draw_humans(model, person, (request.seed, *(back.seed for back in backs)), on_step)
         else:
             human, others = reconstruct_human(model, person, request.seed, on_step), []
         encoded = time.perf_counter()
@@ -108,20 +106,6 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
 def _backs(request: ReconstructRequest, folder: Path) -> list[VariationFiles]:
     first = 0 if request.seed is None else request.seed + 1
     return [variation_files(folder, seed) for seed in range(first, first + request.backs)]
-
-
-def _drawn(
-    model: DiffusionModel, person: CapturedPerson, seeds: Sequence[int | None], on_step: Callable[[], None]
-) -> Iterator[Human]:
-    """As `reconstruct_human` for each seed. What takes longest, the search for outfit and hair, is done once."""
-    components, views = PriorFit.of(model), person.views
-    frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
-    explanation = components.start(views, frames, on_step)
-    for seed in seeds:
-        origin: dict[str, Any] = {"reconstructed_from": person.subject, **({} if seed is None else {"seed": seed})}
-        generator = None if seed is None else torch.Generator().manual_seed(seed)
-        payload = components.fit(views, frames, explanation, on_step, generator)
-        yield Human(payload, person.betas, {**origin, **made_by(model)}).validate()
 
 
 def fit_posture(request: FitPostureRequest, session: Session, report: ReportProgress) -> FitPostureAnswer:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,23 +104,40 @@ def reconstruct(
 
     Raises ValueError if the encoder's output is not finite, or as `PriorFit.of`.
     """
-    origin: dict[str, Any] = {"reconstructed_from": person.subject}
-    if person.frame is not None:
-        origin |= {"frame": person.frame, "views": list(person.cameras)}
-    if isinstance(model, EncoderModel):
-        payload = encode_and_fit(model, person.views, person.betas)
-        origin |= {"checkpoint": model.card.get("name", "unnamed"), "full_density": model.config.full_density}
-        betas = betas_of_frames(model.config, person.betas)
-        return Human(payload, betas, {**origin, "version": __version__}, model.body_setup).to("cpu").validate()
-    components, views, generator = PriorFit.of(model), person.views, None
+    if isinstance(model, DiffusionModel):
+        return next(draw_humans(model, person, (seed,), on_step))
+    payload = encode_and_fit(model, person.views, person.betas)
+    origin = {"checkpoint": model.card.get("name", "unnamed"), "full_density": model.config.full_density}
+    betas, provenance = (
+        betas_of_frames(model.config, person.betas),
+        {**_origin(person), **origin, "version": __version__},
+    )
+    return Human(payload, betas, provenance, model.body_setup).to("cpu").validate()
+
+
+def draw_humans(
+    model: DiffusionModel,
+    person: CapturedPerson,
+    seeds: Sequence[int | None],
+    on_step: Callable[[], None] = lambda: None,
+) -> Iterator[Human]:
+    """As `reconstruct`, a human for each seed; what takes longest, the search for outfit and hair, is done once."""
+    components, views = PriorFit.of(model), person.views
     if views.pose.translation.ndim > 1:
         frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
     else:
         frames = [default_frames(person.betas, views.pose)] * len(views.rgba)
-    if seed is not None:
-        origin["seed"], generator = seed, torch.Generator().manual_seed(seed)
-    payload = components.fit(views, frames, components.start(views, frames, on_step), on_step, generator)
-    return Human(payload, person.betas, {**origin, **made_by(model)}).validate()
+    explanation = components.start(views, frames, on_step)
+    for seed in seeds:
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        payload = components.fit(views, frames, explanation, on_step, generator)
+        drawn = {} if seed is None else {"seed": seed}
+        yield Human(payload, person.betas, {**_origin(person), **drawn, **made_by(model)}).validate()
+
+
+def _origin(person: CapturedPerson) -> dict[str, Any]:
+    of_capture = {} if person.frame is None else {"frame": person.frame, "views": list(person.cameras)}
+    return {"reconstructed_from": person.subject, **of_capture}
 
 
 def steps_of(model: EncoderModel | DiffusionModel) -> int:
