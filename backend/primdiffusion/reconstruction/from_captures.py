@@ -107,12 +107,9 @@ def reconstruct(
     if isinstance(model, DiffusionModel):
         return next(draw_humans(model, person, (seed,), on_step))
     payload = encode_and_fit(model, person.views, person.betas)
-    origin = {"checkpoint": model.card.get("name", "unnamed"), "full_density": model.config.full_density}
-    betas, provenance = (
-        betas_of_frames(model.config, person.betas),
-        {**_origin(person), **origin, "version": __version__},
-    )
-    return Human(payload, betas, provenance, model.body_setup).to("cpu").validate()
+    origin = {**_origin(person), "checkpoint": model.card.get("name", "unnamed"), "version": __version__}
+    origin["full_density"] = model.config.full_density
+    return Human(payload, betas_of_frames(model.config, person.betas), origin, model.body_setup).to("cpu").validate()
 
 
 def draw_humans(
