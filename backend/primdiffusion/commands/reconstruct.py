@@ -47,7 +47,7 @@ ENCODER_VIEWS = 8
 START_WORK, FIT_WORK = 4, 15
 """Work of a step of `PriorFit.start` and of `PriorFit.fit`; that of a step of the posture is 1."""
 SURE_AFTER_S = 3.0
-"""Seconds until the time left is told; the first steps compile."""
+"""Seconds until the time left is reported; the first steps compile."""
 POSTURE_FILE, MASK_FILE = "posture.json", "mask.png"
 
 

@@ -60,10 +60,9 @@ class Surfaces(TensorRecord):
         """The median colour of a person's boxes: some may be covered, by hair for example."""
         voxels = voxels_of(cells[self.cell[rows]])
         weight = (self.share[rows] - SURELY).clamp_min(0) * seen(voxels)
+        tone = (self.tone[rows] * weight).sum(1, keepdim=True)
+        of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / tone.clamp_min(1e-6)
         sure = weight.sum(1) > 0
-        of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / (self.tone[rows] * weight).sum(1).clamp_min(1e-6)[
-            :, None
-        ]
         return of_boxes[sure].median(0).values if sure.any() else of_boxes.mean(0)
 
 

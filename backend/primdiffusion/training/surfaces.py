@@ -30,7 +30,7 @@ PASSES = 3
 CHUNK = 16
 """People whose voxels are in memory at once."""
 NO_HAIR, ALL_HAIR = 0.4, 0.8
-"""Slopes of a voxel's colour against that of hair of its tone, between which its share of hair rises from 0 to 1."""
+"""Slopes of a voxel's colour on the hair's, as shares of its tone: below is no hair, above all of it is."""
 DARKEST = 0.5
 """Tones below this count as this: chance is large beside a dark voxel's colour."""
 FEWEST_VOXELS, SOLID = 8, 0.3
@@ -38,7 +38,7 @@ FEWEST_VOXELS, SOLID = 8, 0.3
 BALD = 0.3
 """Share of the variance of hair that is not the skin's; with less the head is bald."""
 COVERED, OTHERS = 0.85, 0.3
-"""Least slope of a box's colour, of its tone, against that of the surface, and largest ones against other colours."""
+"""Least slope of a box's colour on the surface's, as a share of its tone, and largest slopes on other colours."""
 UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
 UNEVEN_GARMENT = 0.0125
@@ -64,13 +64,13 @@ def fit_surfaces(
 
     The people's attributes say who has them: `config.outfit`, `config.hair`, "pattern" (plain) and "hat" (none).
     """
-    known = _Known(people, codec, vocabulary, config)
+    known = _People(people, codec, vocabulary, config)
     found: list[tuple[Tensor, _Rows]] = []
     for outfit in vocabulary.categories.get(config.outfit, ()):
         worn = {config.outfit: outfit}
-        found += known.of_boxes(worn, "hands", ("torso", "hips"), skin=True)
+        found += known.covering(worn, "hands", ("torso", "hips"), skin=True)
         for region, others in (("torso", ("hands", "hips")), ("hips", ("hands", "torso"))):
-            found += known.of_boxes({**worn, **known.only("pattern", "plain")}, region, others)
+            found += known.covering({**worn, **known.only("pattern", "plain")}, region, others)
     for hair in vocabulary.categories.get(config.hair, ()):
         found += known.hair({config.hair: hair, **known.only("hat", "none")}, hair in config.hanging)
     if not found:
@@ -80,8 +80,8 @@ def fit_surfaces(
     return Surfaces(torch.stack(conditions), surface, *(torch.cat(each) for each in zip(*rows, strict=True)))
 
 
-class _Known:
-    """Detailed people, and the mean colours of their boxes."""
+class _People:
+    """Detailed people, with the mean colours of their boxes."""
 
     def __init__(
         self, people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
@@ -111,10 +111,10 @@ class _Known:
         few = len(self.geometry[own].unique()) < FEWEST_GEOMETRIES
         return row, (own & (not few)).nonzero()[:, 0]
 
-    def of_boxes(
+    def covering(
         self, attributes: Mapping[str, str], region: str, others: Sequence[str], skin: bool = False
     ) -> list[tuple[Tensor, _Rows]]:
-        """The surface that a region shows, in all boxes that it covers; of skin, the face's colour is the others'."""
+        """The surface that a region shows, in all boxes that it covers; skin takes the colour of the face."""
         row, own = self.with_all(attributes)
         own = own[~self.hanging[own]]
         if not len(own):
