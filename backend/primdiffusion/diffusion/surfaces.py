@@ -47,22 +47,32 @@ class Surfaces(TensorRecord):
         """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour."""
         recoloured = cells.clone()
         missing = self.condition.sum(1) - kind @ self.condition.T
-        for person, surface in (missing < 0.5).nonzero().tolist():
-            own = self.surface == surface
-            colour = self._colour(cells[person], own & self.read)
-            own &= self.drawn
-            rgb = voxels_of(recoloured[person, self.cell[own]])[..., :3]
-            rgb = torch.lerp(rgb, self.tone[own][..., None] * colour, self.share[own][..., None])
-            recoloured[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
+        for person, its in enumerate(missing < 0.5):
+            surfaces = its.nonzero()[:, 0].tolist()
+            covered = torch.zeros(len(cells[person]), S**3)
+            colours = {}
+            for surface in reversed(surfaces):
+                own = self.surface == surface
+                colours[surface] = self._colour(cells[person], own & self.read, 1 - covered)
+                own &= self.drawn
+                covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
+            for surface in surfaces:
+                own = (self.surface == surface) & self.drawn
+                rgb = voxels_of(recoloured[person, self.cell[own]])[..., :3]
+                rgb = torch.lerp(rgb, self.tone[own][..., None] * colours[surface], self.share[own][..., None])
+                recoloured[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
         return recoloured
 
-    def _colour(self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"]) -> Float[Tensor, "3"]:
-        """The median colour of a person's boxes: some may be covered, by hair for example."""
+    def _colour(
+        self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"], bare: Float[Tensor, "k 512"]
+    ) -> Float[Tensor, "3"]:
+        """The median colour of a person's boxes, of voxels that no later surface covers."""
         voxels = voxels_of(cells[self.cell[rows]])
-        weight = (self.share[rows] - SURELY).clamp_min(0) * seen(voxels)
+        whole = (self.share[rows] - SURELY).clamp_min(0) * seen(voxels)
+        weight = whole * bare[self.cell[rows]]
         tone = (self.tone[rows] * weight).sum(1, keepdim=True)
         of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / tone.clamp_min(1e-6)
-        sure = weight.sum(1) > 0
+        sure = weight.sum(1) > whole.sum(1) / 2
         return of_boxes[sure].median(0).values if sure.any() else of_boxes.mean(0)
 
 

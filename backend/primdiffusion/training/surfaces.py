@@ -43,6 +43,12 @@ UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
 UNEVEN_GARMENT = 0.0125
 """The same in the median over a garment's boxes: more are prints and fades, which plain garments may have too."""
+UNEVEN_BORDER = 0.09
+"""The same of voxels where surfaces meet, in boxes that are wholly explained by them."""
+UNEXPLAINED = 0.3
+"""Largest share of their variance that the surfaces leave."""
+LEAST_SHARE = 0.05
+"""Of a voxel: less is chance."""
 FEWEST_BOXES = 8
 """Of a garment, or of skin."""
 
@@ -67,12 +73,12 @@ def fit_surfaces(
     known = _People(people, codec, vocabulary, config)
     found: list[tuple[Tensor, _Rows]] = []
     for outfit in vocabulary.categories.get(config.outfit, ()):
-        worn = {config.outfit: outfit}
-        found += known.covering(worn, "hands", ("torso", "hips"), skin=True)
-        for region, others in (("torso", ("hands", "hips")), ("hips", ("hands", "torso"))):
-            found += known.covering({**worn, **known.only("pattern", "plain")}, region, others)
+        found += known.worn({config.outfit: outfit}, known.only("pattern", "plain"))
     for hair in vocabulary.categories.get(config.hair, ()):
-        found += known.hair({config.hair: hair, **known.only("hat", "none")}, hair in config.hanging)
+        found += known.hair({config.hair: hair}, known.only("hat", "none"), hair in config.hanging)
+    for hat in vocabulary.categories.get("hat", ()):
+        if hat != "none":
+            found += known.hair({"hat": hat})
     if not found:
         return None
     conditions, rows = zip(*found, strict=True)
@@ -104,49 +110,99 @@ class _People:
         for some in people.split(CHUNK):
             yield voxels_of(self.codec.decode(self.latents[some].float()))
 
-    def with_all(self, attributes: Mapping[str, str]) -> tuple[Float[Tensor, "a"], Int[Tensor, "n"]]:
-        """A condition, and the people of whom it is true; none if they are of few geometries."""
+    def with_all(
+        self, attributes: Mapping[str, str], hanging: bool = True
+    ) -> tuple[Float[Tensor, "a"], Int[Tensor, "n"]]:
+        """A condition, and the people of whom it is true; none if they are of few geometries.
+
+        Hanging hair covers clothes: without, people who have it are left out.
+        """
         row = self.vocabulary.encode(attributes)
-        own = self.condition @ row >= row.sum()
+        own = (self.condition @ row >= row.sum()) & (hanging | ~self.hanging)
         few = len(self.geometry[own].unique()) < FEWEST_GEOMETRIES
         return row, (own & (not few)).nonzero()[:, 0]
 
-    def covering(
-        self, attributes: Mapping[str, str], region: str, others: Sequence[str], skin: bool = False
-    ) -> list[tuple[Tensor, _Rows]]:
-        """The surface that a region shows, in all boxes that it covers; skin takes the colour of the face."""
-        row, own = self.with_all(attributes)
-        own = own[~self.hanging[own]]
+    def worn(self, attributes: Mapping[str, str], plain: Mapping[str, str]) -> list[tuple[Tensor, _Rows]]:
+        """Skin and plain garments of an outfit, in the boxes that they cover and in the voxels where they meet."""
+        row, own = self.with_all(attributes, hanging=False)
+        boxes, face = self.boxes[own], region_of(("face",))
         if not len(own):
             return []
-        boxes, face = self.boxes[own], region_of(("face",))
-        never = region_of(("hair",)) if skin else region_of(("head", "hands"))
-        beside = [boxes[:, region_of((name,))].mean(1) for name in others]
-        covered = region_of((region,))
-        for _ in range(PASSES):
-            colour = boxes[:, covered].mean(1)
-            slope, by_others = _slopes(boxes, [colour, *beside]).split([1, len(beside)], dim=-1)
-            tone = torch.einsum("nc,nkc->k", colour, boxes) / colour.square().sum()
-            uneven = (boxes - tone[:, None] * colour[:, None]).square().mean((0, 2)).sqrt()
-            covered = (slope[:, 0] / tone.clamp(DARKEST, 1 / DARKEST) > COVERED) & (uneven < UNEVEN) & ~never
-            covered &= (by_others.abs() < OTHERS).all(-1)
-            if covered.sum() < FEWEST_BOXES:
-                return []
-        read = covered & face if skin else covered
-        if not read.any() or (not skin and float(uneven[covered].median()) > UNEVEN_GARMENT):
+        beside = [boxes[:, region_of((name,))].mean(1) for name in ("torso", "hips")]
+        skin = _covered(boxes, region_of(("hands",)), beside, ~region_of(("hair",)))
+        if skin is None or not (skin & face).any():
             return []
-        colour = boxes[:, read].mean(1)
+        found = [(row, self.rows(own, skin, read=face, drawn=~face))]
+        row, own = self.with_all({**attributes, **plain}, hanging=False)
+        boxes, parts, left = self.boxes[own], [skin & face], ~skin & ~region_of(("face", "hair", "hands"))
+        while len(own) and (start := _largest(boxes, left)) is not None:
+            garment = _covered(boxes, start, [boxes[:, part].mean(1) for part in parts], left)
+            if garment is None:
+                left &= ~start
+                continue
+            left &= ~(start | garment)
+            if _tones(boxes, garment)[1][garment].median() < UNEVEN_GARMENT:
+                parts.append(garment)
+        if len(parts) == 1:
+            return found
+        meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
+        everywhere = torch.ones_like(skin)
+        for part, border in zip(parts, self.borders(own, parts, meet), strict=True):
+            drawn = everywhere if part is not parts[0] else ~everywhere
+            whole = self.rows(own, part, read=everywhere, drawn=drawn)
+            found.append((row, _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))))
+        return found
+
+    def rows(
+        self, own: Int[Tensor, "n"], part: Bool[Tensor, "k"], read: Bool[Tensor, "k"], drawn: Bool[Tensor, "k"]
+    ) -> _Rows:
+        """A surface in the boxes that it covers; its colour is that of boxes where it is read."""
+        colour = self.boxes[own][:, part & read].mean(1)
         by_colour = sum(
-            torch.einsum("nc,nkvc->kv", some, voxels[:, covered, :, :3])
+            torch.einsum("nc,nkvc->kv", some, voxels[:, part, :, :3])
             for some, voxels in zip(colour.split(CHUNK), self.voxels(own), strict=True)
         )
         tones = (by_colour / colour.square().sum()).clamp(0, BRIGHTEST)
-        drawn = ~face if skin else covered
-        return [(row, _Rows(covered.nonzero()[:, 0], torch.ones_like(tones), tones, read[covered], drawn[covered]))]
+        return _Rows(part.nonzero()[:, 0], torch.ones_like(tones), tones, read[part], drawn[part])
 
-    def hair(self, attributes: Mapping[str, str], hanging: bool) -> list[tuple[Tensor, _Rows]]:
-        """The voxels of a style of hair on the head, and on the clothes if it hangs over them."""
-        row, own = self.with_all(attributes)
+    def borders(
+        self, own: Int[Tensor, "n"], parts: Sequence[Bool[Tensor, "k"]], meet: Bool[Tensor, "k"]
+    ) -> Iterator[_Rows]:
+        """Voxels of each of these surfaces in the boxes where some meet, if they explain the box on other people too.
+
+        A surface is drawn over those before it, so its share is that of what later ones leave.
+        """
+        cells = meet.nonzero()[:, 0]
+        number = self.geometry[own].unique(return_inverse=True)[1]
+        one, other = (
+            _Meeting.of([self.boxes[half][:, part].mean(1) for part in parts], self.voxels(half), meet)
+            for half in (own[number % 2 == 0], own[number % 2 == 1])
+        )
+        error, spread = ((a + b) / 2 for a, b in zip(one.tested(other), other.tested(one), strict=True))
+        explained = (error < UNEXPLAINED * spread) & (error.sqrt() < UNEVEN_BORDER)
+        both = _Meeting(*(a + b for a, b in zip(one, other, strict=True)))
+        parts_of, tone = both.fitted()
+        weight = both.seen / both.seen.sum(1, keepdim=True).clamp_min(1e-6)
+        explained &= (parts_of * weight[..., None]).sum(1).amax(1) < COVERED
+        above = torch.zeros(len(cells), S**3)
+        borders = []
+        for of_part in reversed(parts_of.unbind(-1)):
+            share = (of_part / (1 - above).clamp_min(1e-6)).clamp(0, 1)
+            above += of_part
+            kept = explained & (of_part > LEAST_SHARE).any(1)
+            rows = share[kept], tone[kept], torch.zeros_like(kept)[kept], torch.ones_like(kept)[kept]
+            borders.append(_Rows(cells[kept], *rows))
+        return reversed(borders)
+
+    def hair(
+        self, attributes: Mapping[str, str], shown: Mapping[str, str] = {}, hanging: bool = False
+    ) -> list[tuple[Tensor, _Rows]]:
+        """The voxels of a style of hair, or a hat, on the head, and on the clothes if it hangs over them.
+
+        They are found on people with the attributes `shown` too: those without a hat.
+        """
+        row = self.vocabulary.encode(attributes)
+        _, own = self.with_all({**attributes, **shown})
         if not len(own):
             return []
         head, below = region_of(("head",)), region_of(("torso", "hips", "arms"))
@@ -179,21 +235,108 @@ class _People:
         return [(row, _Rows(cells[kept], share[kept], tone[kept], on_head[kept], torch.ones_like(on_head[kept])))]
 
 
+class _Meeting(NamedTuple):
+    """Sums over people of boxes where surfaces meet: voxels, their colours as mixtures of those of Q surfaces."""
+
+    normal: Float[Tensor, "q q"]
+    by_design: Float[Tensor, "k 512 q"]
+    total: Float[Tensor, "k 512 3"]
+    square: Float[Tensor, "k 512"]
+    seen: Float[Tensor, "k 512"]
+    people: Int[Tensor, ""]
+
+    @classmethod
+    def of(
+        cls,
+        colours: Sequence[Float[Tensor, "n 3"]],
+        people: Iterator[Float[Tensor, "m 1024 512 4"]],
+        cells: Bool[Tensor, "k"],
+    ) -> _Meeting:
+        normal, design = _normal(colours, centred=False)
+        parts = []
+        for x, voxels in zip(design.split(CHUNK), people, strict=True):
+            rgb = voxels[:, cells, :, :3]
+            by_design = torch.einsum("ncq,nkvc->kvq", x, rgb)
+            parts.append((by_design, rgb.sum(0), rgb.square().sum((0, 3)), seen(voxels[:, cells]).sum(0)))
+        return cls(normal, *(sum(each) for each in zip(*parts, strict=True)), torch.tensor(len(design)))
+
+    def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
+        """How much of a voxel each surface is, and its tone."""
+        slopes = torch.linalg.solve(self.normal, self.by_design[..., None])[..., 0].clamp_min(0)
+        slopes = torch.stack([_smooth(slope) for slope in slopes.unbind(-1)], dim=-1)
+        shares = slopes / slopes.sum(-1, keepdim=True).clamp_min(1e-6)
+        along, power = self._products(shares)
+        return shares, (along / power).clamp(0, BRIGHTEST)
+
+    def tested(self, other: _Meeting) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
+        """Mean squares over each box of what the fit to others leaves, and of differences between people."""
+        shares, tone = other.fitted()
+        along, power = self._products(shares)
+        error = self.square - 2 * tone * along + tone.square() * power
+        spread = self.square - self.total.square().sum(-1) / self.people
+        weight = self.seen / (3 * self.people * self.seen.sum(1, keepdim=True).clamp_min(1e-6))
+        return (error * weight).sum(1), (spread * weight).sum(1)
+
+    def _products(self, shares: Float[Tensor, "k 512 q"]) -> tuple[Float[Tensor, "k 512"], Float[Tensor, "k 512"]]:
+        """Of mixtures with the voxels, and with themselves."""
+        power = torch.einsum("kvq,qr,kvr->kv", shares, self.normal, shares)
+        return (shares * self.by_design).sum(-1), power.clamp_min(1e-6)
+
+
 def _mean(voxels: Float[Tensor, "*b v 4"], weight: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 3"]:
     """Mean colour of voxels."""
     total = (voxels[..., :3] * weight[..., None]).sum(-2)
     return total / weight.sum(-1, keepdim=True).clamp_min(1e-6)
 
 
-def _normal(colours: Sequence[Float[Tensor, "n 3"]]) -> tuple[Float[Tensor, "q q"], Float[Tensor, "n 3 q"]]:
+def _normal(
+    colours: Sequence[Float[Tensor, "n 3"]], centred: bool = True
+) -> tuple[Float[Tensor, "q q"], Float[Tensor, "n 3 q"]]:
     """The normal matrix of a regression on colours, with the same slope for red, green and blue, and its design."""
-    design = torch.stack([colour - colour.mean(0) for colour in colours], dim=-1)
+    design = torch.stack([colour - colour.mean(0) if centred else colour for colour in colours], dim=-1)
     return torch.einsum("ncq,ncr->qr", design, design) + 1e-2 * torch.eye(len(colours)), design
 
 
 def _slopes(values: Float[Tensor, "n k 3"], colours: Sequence[Float[Tensor, "n 3"]]) -> Float[Tensor, "k q"]:
     normal, design = _normal(colours)
     return torch.linalg.solve(normal, torch.einsum("ncq,nkc->kq", design, values)[..., None])[..., 0]
+
+
+def _tones(boxes: Float[Tensor, "n k 3"], part: Bool[Tensor, "k"]) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
+    """Tones of boxes of a part's colour, and rms differences from them."""
+    colour = boxes[:, part].mean(1)
+    tone = torch.einsum("nc,nkc->k", colour, boxes) / colour.square().sum().clamp_min(1e-6)
+    return tone, (boxes - tone[:, None] * colour[:, None]).square().mean((0, 2)).sqrt()
+
+
+def _covered(
+    boxes: Float[Tensor, "n k 3"],
+    start: Bool[Tensor, "k"],
+    others: Sequence[Float[Tensor, "n 3"]],
+    within: Bool[Tensor, "k"],
+) -> Bool[Tensor, "k"] | None:
+    """The boxes `within` that follow the colour of those of the start, and no other; None if they are few."""
+    covered = start
+    for _ in range(PASSES):
+        tone, uneven = _tones(boxes, covered)
+        slope, by_others = _slopes(boxes, [boxes[:, covered].mean(1), *others]).split([1, len(others)], dim=-1)
+        covered = (slope[:, 0] / tone.clamp(DARKEST, 1 / DARKEST) > COVERED) & (uneven < UNEVEN) & within
+        covered &= (by_others.abs() < OTHERS).all(-1)
+        if covered.sum() < FEWEST_BOXES:
+            return None
+    return covered
+
+
+def _largest(boxes: Float[Tensor, "n k 3"], left: Bool[Tensor, "k"]) -> Bool[Tensor, "k"] | None:
+    """The most boxes among those left that have the tones of one of them; None if they are few."""
+    of_boxes = boxes[:, left].transpose(0, 1).flatten(1)
+    products = of_boxes @ of_boxes.T
+    tone = products / products.diagonal().clamp_min(1e-6)
+    uneven = ((products.diagonal()[:, None] - tone * products).clamp_min(0) / of_boxes.shape[1]).sqrt()
+    alike = (uneven < UNEVEN) & (tone > DARKEST) & (tone < 1 / DARKEST)
+    if not len(alike) or alike.sum(0).max() < FEWEST_BOXES:
+        return None
+    return torch.zeros_like(left).masked_scatter(left, alike[:, alike.sum(0).argmax()])
 
 
 def _left_of(colour: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> float:

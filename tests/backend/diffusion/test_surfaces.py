@@ -20,7 +20,7 @@ from support.tiny import model_of_two_kinds
 
 WORDS = AttributeVocabulary(
     {
-        "outfit": ("jumper", "tee"),
+        "outfit": ("jumper", "suit", "tee"),
         "pattern": ("patterned", "plain"),
         "hair": ("bald", "long", "short"),
         "hat": ("cap", "none"),
@@ -28,6 +28,7 @@ WORDS = AttributeVocabulary(
     {},
 )
 GEOMETRIES, COLOURINGS = 6, 6
+WORN = ("hair", "tee", "trousers", "skin", "cap")
 INNER, OUTER = slice(0, S**3 // 2), slice(S**3 // 2, S**3)
 """Halves of a box, near the body and away from it."""
 FAR_IN, FAR_OUT = slice(0, S**3 // 2 - S**2), slice(S**3 // 2 + S**2, S**3)
@@ -35,6 +36,8 @@ FAR_IN, FAR_OUT = slice(0, S**3 // 2 - S**2), slice(S**3 // 2 + S**2, S**3)
 HANGING, CUFF = 0.6, 0.8
 """Tones of hair that hangs, and of a tee's lower part."""
 TOP, CUFFS, BARE = ("torso", "upper_arms"), ("upper_arms",), ("forearms", "hands", "shins", "face")
+COLLAR = ("neck",)
+"""The outer half is the tee's; the inner one is skin."""
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +56,13 @@ def below_hair():
     return region_of(("torso",)).nonzero()[::4, 0]
 
 
-def dressed(hair, colours, generator, patterned=False):
-    """Cells of a person in a tee and faded trousers; each box of a patterned tee has a colour of its own."""
+def below_cap():
+    """Boxes of hair that a cap covers."""
+    return region_of(("hair",)).nonzero()[::2, 0]
+
+
+def dressed(hair, colours, generator, patterned=False, cap=False, suit=False):
+    """Cells of a person in a tee and faded trousers, or a suit; boxes of a patterned tee have colours of their own."""
     voxels = torch.zeros(K, S**3, 4)
     voxels[..., 3] = 1.0
     voxels[..., :3] = colours["skin"]
@@ -63,6 +71,9 @@ def dressed(hair, colours, generator, patterned=False):
     voxels[trousers, :, :3] = fades * colours["trousers"]
     voxels[region_of(TOP), :, :3] = colours["tee"]
     voxels[region_of(CUFFS), :, :3] *= CUFF
+    voxels[region_of(COLLAR), OUTER, :3] = colours["tee"]
+    if suit:
+        voxels[region_of((*TOP, "hips", "thighs")), :, :3] = colours["tee"]
     if patterned:
         voxels[region_of(TOP), :, :3] = torch.rand(int(region_of(TOP).sum()), 1, 3, generator=generator)
     if hair == "bald":
@@ -71,12 +82,14 @@ def dressed(hair, colours, generator, patterned=False):
         voxels[region_of(("hair",)), OUTER, :3] = colours["hair"]
     if hair == "long":
         voxels[below_hair(), OUTER, :3] = HANGING * colours["hair"]
+    if cap:
+        voxels[below_cap(), :, :3] = colours["cap"]
     return torch.nn.functional.pad(voxels.mT.flatten(1), (0, 3), value=SCALE_VALUE)
 
 
 def some_colours(generator):
     """Dark hair goes with dark skin."""
-    drawn = {name: 0.15 + 0.7 * torch.rand(3, generator=generator) for name in ("hair", "tee", "trousers", "skin")}
+    drawn = {name: 0.15 + 0.7 * torch.rand(3, generator=generator) for name in WORN}
     return drawn | {"skin": 0.75 * drawn["skin"] + 0.25 * drawn["hair"]}
 
 
@@ -84,13 +97,14 @@ def some_colours(generator):
 def people(codec):
     generator = torch.Generator().manual_seed(1)
     cells, conditions = [], []
-    names = [hair for hair in ("long", "short", "bald") for _ in range(GEOMETRIES)]
-    for geometry, hair in enumerate(names):
+    names = [hair for hair in ("long", "short", "bald", "cap", "suit") for _ in range(GEOMETRIES)]
+    for name in names:
+        cap, suit, hair = name == "cap", name == "suit", name if name in WORDS.categories["hair"] else "short"
         for number in range(COLOURINGS):
-            patterned = number == 0
-            cells.append(dressed(hair, some_colours(generator), generator, patterned))
-            known = {"outfit": "tee", "pattern": "patterned" if patterned else "plain"}
-            conditions.append(WORDS.encode({**known, "hair": hair, "hat": "cap" if geometry == 0 else "none"}))
+            patterned = number == 0 and not suit
+            cells.append(dressed(hair, some_colours(generator), generator, patterned, cap, suit))
+            known = {"outfit": "suit" if suit else "tee", "pattern": "patterned" if patterned else "plain"}
+            conditions.append(WORDS.encode({**known, "hair": hair, "hat": "cap" if cap else "none"}))
     geometry = torch.arange(len(names)).repeat_interleave(COLOURINGS)
     latents = codec.encode(torch.stack(cells)).half()
     return LatentSet(
@@ -120,7 +134,7 @@ def over(values, cells):
 
 
 def test_hair_is_found_where_people_of_a_style_have_it(surfaces):
-    (long,), (short,) = (rows_of(surfaces, hair=hair, hat="none") for hair in ("long", "short"))
+    (long,), (short,) = (rows_of(surfaces, hair=hair) for hair in ("long", "short"))
     for style in (long, short):
         share = over(style.share, style.cell)[region_of(("hair",))]
         assert float(share[:, FAR_OUT].min()) > 0.9
@@ -132,13 +146,13 @@ def test_hair_is_found_where_people_of_a_style_have_it(surfaces):
     bare = region_of(("torso",)).index_fill(0, below_hair(), False)
     assert not over(long.share, long.cell)[bare].any()
     assert not over(short.share, short.cell)[region_of(("torso", "legs", "hands"))].any()
-    assert not rows_of(surfaces, hair="bald", hat="none")  # whose scalp has the colour of the hands
+    assert not rows_of(surfaces, hair="bald")  # whose scalp has the colour of the hands
 
 
 def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
     garments, (skin,) = rows_of(surfaces, outfit="tee", pattern="plain"), rows_of(surfaces, outfit="tee")
     tee = next(each for each in garments if region_of(("torso",))[each.cell].any())
-    assert torch.equal(over(torch.ones_like(tee.cell), tee.cell) > 0, region_of(TOP))
+    assert torch.equal(over(tee.read, tee.cell), region_of(TOP))
     tone = over(tee.tone, tee.cell)
     ratio = float(tone[region_of(CUFFS)].mean() / tone[region_of(("torso",))].mean())
     assert ratio == pytest.approx(CUFF, abs=0.02)
@@ -149,20 +163,41 @@ def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
     assert not any(region_of(("thighs",))[each.cell].any() for each in garments)  # fades are no chance
 
 
-def test_what_took_other_colours_gets_its_own_back(surfaces):
+def test_a_suit_of_one_cloth_is_one_surface(surfaces):
+    (suit,) = (each for each in rows_of(surfaces, outfit="suit", pattern="plain") if each.drawn.all())
+    assert torch.equal(over(suit.read, suit.cell), region_of((*TOP, "hips", "thighs")))
+
+
+def test_voxels_where_surfaces_meet_belong_to_each(surfaces):
+    bare, tee = (each for each in rows_of(surfaces, outfit="tee", pattern="plain"))
+    collar = region_of(COLLAR)
+    assert region_of(("face",))[bare.cell[bare.read]].all()
+    below, above = (over(part.share * part.drawn[:, None], part.cell) for part in (bare, tee))
+    assert float(above[collar][:, FAR_OUT].min()) > 0.9
+    assert float(above[collar][:, FAR_IN].max()) < 0.1
+    assert float(below[collar][:, FAR_IN].min()) > 0.9
+    for part, share in ((bare, below), (tee, above)):
+        assert not part.read[collar[part.cell]].any()
+        assert not share[region_of(("shins", "feet", "thighs"))].any()  # which no two surfaces share
+
+
+@pytest.mark.parametrize("cap", [False, True])
+def test_what_took_other_colours_gets_its_own_back(surfaces, cap):
     generator = torch.Generator().manual_seed(7)
     colours = some_colours(generator)
-    right = dressed("long", colours, generator)
+    right = dressed("long", colours, generator, cap=cap)
     wrong = voxels_of(right).clone()
     below, bare = below_hair(), region_of(("forearms", "hands", "shins"))
     wrong[below, OUTER, :3] = (wrong[below, OUTER, :3] + colours["tee"]) / 2  # hair of the shirt's colour
     blotches = region_of(("torso",)).nonzero()[1::4, 0]
     wrong[blotches, :, :3] *= 0.7
     wrong[bare, :, :3] *= 0.8  # darker than the face
+    crown = below_cap()[::4] if cap else region_of(("hair",)).nonzero()[::4, 0]
+    wrong[crown, OUTER, :3] *= 0.5
     wrong = torch.nn.functional.pad(wrong.mT.flatten(1), (0, 3), value=SCALE_VALUE)
-    kind = WORDS.encode({"outfit": "tee", "pattern": "plain", "hair": "long", "hat": "none"})[None]
+    kind = WORDS.encode({"outfit": "tee", "pattern": "plain", "hair": "long", "hat": "cap" if cap else "none"})[None]
     mended = surfaces.recolour(wrong[None], kind)[0]
-    for region, part in ((below, FAR_OUT), (blotches, slice(None)), (bare, slice(None))):
+    for region, part in ((below, FAR_OUT), (crown, FAR_OUT), (blotches, slice(None)), (bare, slice(None))):
         before, after = (
             float((voxels_of(cells) - voxels_of(right))[region, part, :3].abs().mean()) for cells in (wrong, mended)
         )
@@ -172,7 +207,7 @@ def test_what_took_other_colours_gets_its_own_back(surfaces):
     assert torch.equal(voxels_of(mended)[..., 3], voxels_of(wrong)[..., 3])
 
 
-@pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {"hair": "long", "hat": "cap"}, {}])
+@pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {}])
 def test_people_without_known_surfaces_stay_as_they_are(surfaces, known):
     cells = torch.rand(1, K, VALUES)
     assert torch.equal(surfaces.recolour(cells, WORDS.encode({"outfit": "jumper", **known})[None]), cells)
@@ -192,7 +227,8 @@ def test_few_people_or_unknown_ones_have_no_surfaces(people, codec):
         detailed=few.sum(),
     )  # fmt: skip
     assert fit_surfaces(some, codec, WORDS, PriorConfig()) is None
-    assert fit_surfaces(people, codec, WORDS, PriorConfig(outfit="nothing", hair="nothing")) is None
+    unknown = dataclasses.replace(people, condition=torch.zeros_like(people.condition))
+    assert fit_surfaces(unknown, codec, WORDS, PriorConfig()) is None
 
 
 def model_with_surfaces():
