@@ -12,9 +12,8 @@ shoes:
     c = centre of the kind + clothes + head + u shared,    u ~ N(0, 1)
 
 `clothes` are Gaussian over all parts but the head, with a covariance for each group (an outfit of a sex, plain or
-patterned, bare or below a style of hair that hangs over it), `head` is one with a covariance for each hair style, and
-`shared` are directions that join the two: the tone of the skin, and the colour of hanging hair. Kinds are many, with
-few people each, so what is common to a group is computed once.
+patterned), `head` is one with a covariance for each hair style, and `shared` are directions that join the two: the tone
+of the skin. Kinds are many, with few people each, so what is common to a group is computed once.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class PriorConfig:
     axes: int = 64
     """Principal axes of a covariance."""
     shared: int = 4
-    """Directions of the skin, which clothes and heads share; as many of the hair of each style in `hanging`."""
+    """Directions of the skin, which clothes and heads share."""
     lean: float = 10.0
     """Shrinkage of the details in the groups' covariances to those of all data: its weight as samples."""
     folds: int = 4

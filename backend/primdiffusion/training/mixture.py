@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,7 +20,6 @@ from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.hanging_hair import HangingHair, find_hanging_hair
 from primdiffusion.training.regression import RIDGE, principal_directions, regress_cells
 
 PASSES = 4
@@ -76,24 +75,15 @@ def fit_mixture(
     groups, heads = keys[:2]
     effects, remainder = _effects(c, clothes, keys)
     skin, skin_of_head, remainder = _skin(remainder, clothes, groups, inside, config)
-    styles, style_of, remainder = _hair(remainder, clothes, heads, vocabulary, inside, config)
-    bare = (style_of == 0)[heads.of_person]
+    bare = _bare(heads, vocabulary, config)[heads.of_person]
     of_bare = groups._replace(of_person=groups.of_person[bare])
-    covariances = _covariances(remainder[bare, :clothes], of_bare, config.outfit, config.lean)
-    below = [
-        (covariances[g], skin[g], style, kinds)
-        for g in range(len(groups.choices))
-        for number, style in enumerate(styles)
-        if (kinds := [kind for kind in _kinds(g, keys) if style_of[kind.choices[1]] == number])
-    ]
-    axes = _axes([style.through.T @ covariance @ style.through for covariance, _, style, _ in below], config.axes)
+    axes = _axes(_covariances(remainder[bare, :clothes], of_bare, config.outfit, config.lean), config.axes)
     head_axes = _axes(_covariances(remainder[:, clothes:], heads, config.hair, config.lean), config.axes)
     return {
         "axes": axes[0], "variance": axes[1], "left": axes[2],
         "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
-        "shared": torch.stack([torch.cat([tone @ style.through, style.of_clothes]) for _, tone, style, _ in below]),
-        "head_shared": torch.stack([torch.cat([skin_of_head, styles[number].of_head]) for number in style_of]),
-        **_kind_fields([(style.through, kinds) for *_, style, kinds in below], effects, c.mean(0), keys, vocabulary),
+        "shared": skin, "head_shared": skin_of_head.repeat(len(heads.choices), 1, 1),
+        **_kind_fields(effects, c.mean(0), keys, vocabulary),
     }  # fmt: skip
 
 
@@ -170,32 +160,17 @@ def _skin(
     return shared, on_head, remainder
 
 
-def _hair(
-    c: Float[Tensor, "n r"],
-    clothes: int,
-    heads: Key,
-    vocabulary: AttributeVocabulary,
-    inside: PersonComponents,
-    config: PriorConfig,
-) -> tuple[list[HangingHair], Int[Tensor, "f"], Float[Tensor, "n r"]]:
-    """Styles of hair, of which the first covers no clothes, the number of each head's style, and what styles leave."""
-    names = [""]
-    style_of = torch.zeros(len(heads.choices), dtype=torch.int64)
-    for head, choice in enumerate(heads.choices):
-        words = [vocabulary.categories[name][v] for name, v in zip(heads.names, choice, strict=True) if v >= 0]
-        style = next((word for word in words if word in config.hanging), "")
-        names += [style] * (style not in names)
-        style_of[head] = names.index(style)
-    if style_of.all() or clothes == c.shape[1]:  # no bare clothes to compare with, or no part for the head
-        names, style_of = [""], torch.zeros_like(style_of)
-    of_person, remainder, found = style_of[heads.of_person], c.clone(), []
-    for number in range(1, len(names)):
-        own = of_person == number
-        style, remainder[own, clothes:] = find_hanging_hair(c[of_person == 0, :clothes], c[own], inside, config.shared)
-        found.append(style)
-    directions = len(found[0].of_head) if found else 0
-    none = c.new_zeros(directions, c.shape[1]).split([clothes, c.shape[1] - clothes], dim=1)
-    return [HangingHair(torch.eye(clothes), *none), *found], style_of, remainder
+def _bare(heads: Key, vocabulary: AttributeVocabulary, config: PriorConfig) -> Bool[Tensor, "f"]:
+    """Heads whose hair does not hang over the clothes; all if it does on all of them.
+
+    The colour of hair would be one of the clothes: locks at the neck of people with short hair, in any colour.
+    """
+    words = [
+        {vocabulary.categories[name][v] for name, v in zip(heads.names, choice, strict=True) if v >= 0}
+        for choice in heads.choices
+    ]
+    bare = torch.tensor([not own.intersection(config.hanging) for own in words])
+    return bare | ~bare.any()
 
 
 def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> list[Float[Tensor, "i i"]]:
@@ -268,23 +243,22 @@ def _kinds(group: int, keys: Sequence[Key]) -> list[Kind]:
 
 
 def _kind_fields(
-    below: Sequence[tuple[Float[Tensor, "o o"], Sequence[Kind]]],
     effects: Sequence[Float[Tensor, "v r"]],
     mean: Float[Tensor, "r"],
     keys: Sequence[Key],
     vocabulary: AttributeVocabulary,
 ) -> dict[str, Tensor]:
-    """Weights, centres, heads and conditions of kinds, whose clothes are seen through hair."""
-    size = len(below), max(len(kinds) for _, kinds in below)
+    """Weights, centres, heads and conditions of the kinds of all groups."""
+    groups = [_kinds(group, keys) for group in range(len(keys[0].choices))]
+    size = len(groups), max(map(len, groups))
     log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
     centre, condition = torch.zeros(*size, len(mean)), torch.zeros(*size, vocabulary.width)
     blocks = vocabulary.blocks()
-    for g, (through, kinds) in enumerate(below):
+    for g, kinds in enumerate(groups):
         for m, kind in enumerate(kinds):
-            own, *others = (effect[number] for effect, number in zip(effects, kind.choices, strict=True))
-            own = torch.cat([own[: len(through)] @ through, own[len(through) :]])
             log_weight[g, m], head[g, m] = kind.share, kind.choices[1]
-            centre[g, m] = torch.stack([mean, own, *others]).sum(0)
+            of_kind = (effect[number] for effect, number in zip(effects, kind.choices, strict=True))
+            centre[g, m] = torch.stack([mean, *of_kind]).sum(0)
             for key, number in zip(keys, kind.choices, strict=True):
                 for name, value in zip(key.names, key.choices[number], strict=True):
                     if value >= 0:

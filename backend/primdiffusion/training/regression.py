@@ -1,4 +1,4 @@
-"""Regressions on few people: what cells of a person have to do with the skin or with hair.
+"""Regressions on few people: what cells of a person have to do with the skin.
 
 Few people make much of what they happen to share. A cell has many values, which tell more surely than single ones
 whether it shows an effect.
