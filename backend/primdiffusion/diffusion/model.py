@@ -74,7 +74,7 @@ class DiffusionModel:
     body_setup: BodySetup | None = None
     """Body and anchors of the humans it generates; None is the default body."""
     surfaces: Surfaces | None = None
-    """Hair, garments and skin that `decode` gives one colour each; for a person prior with attributes."""
+    """Hair, hats, garments and skin that `decode` gives one colour each; for a person prior with attributes."""
 
     @property
     def device(self) -> torch.device:
@@ -159,7 +159,7 @@ class DiffusionModel:
     def decode(self, x0: Float[Tensor, "*b c h w"]) -> Payload:
         """The payload of clean samples: colours linear in [0, 1], densities 1/m >= 0, ordinary tensors.
 
-        Hair, plain garments and skin have one colour each (`Surfaces`).
+        Hair, hats, plain garments and skin have one colour each (`Surfaces`).
         """
         prior = getattr(self.denoiser, "prior", None)
         if self.surfaces is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):

@@ -1,4 +1,4 @@
-"""Surfaces of one colour: hair, plain garments and skin.
+"""Surfaces of one colour: hair, hats, plain garments and skin.
 
 Person components are directions that all people have in common, so colours of one surface come to others: hair on a
 back has the colour of the shirt, plain shirts have a shade of prints, arms are darker than the face. But a style of

@@ -1,8 +1,9 @@
 """Find surfaces of one colour: boxes and voxels whose colours follow that of a surface on all people who have it.
 
-Hair, garments and skin are found by regressions on the colour of the surface, first that of a region, then that of what
-was found, and on colours that it may go with: dark hair often goes with dark skin. Hair is found in voxels, as it hangs
-over clothes; plain garments and skin in boxes, which they cover from border to border.
+Hair, hats, garments and skin are found by regressions on the colour of the surface, first that of a few boxes, then
+that of what was found, and on colours that it may go with: dark hair often goes with dark skin. Hair and hats are found
+in voxels, as they lie over skin and clothes; plain garments and skin in boxes, which they cover from border to border,
+and in voxels where they meet.
 """
 
 from __future__ import annotations
@@ -66,9 +67,9 @@ class _Rows(NamedTuple):
 def fit_surfaces(
     people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
 ) -> Surfaces | None:
-    """Skin and plain garments of each outfit and each style of hair, of detailed people; None if nothing is found.
+    """Skin and plain garments of each outfit, styles of hair and hats, of detailed people; None if nothing is found.
 
-    The people's attributes say who has them: `config.outfit`, `config.hair`, "pattern" (plain) and "hat" (none).
+    The people's attributes say who has them: `config.outfit`, `config.hair`, "pattern" (plain) and "hat" (or none).
     """
     known = _People(people, codec, vocabulary, config)
     found: list[tuple[Tensor, _Rows]] = []
