@@ -50,8 +50,8 @@ UNEXPLAINED = 0.3
 """Largest share of their variance that the surfaces leave."""
 LEAST_SHARE = 0.05
 """Of a voxel: less is chance."""
-FEWEST_BOXES = 8
-"""Of a garment, or of skin."""
+FEWEST_BOXES = 24
+"""Of a garment, or of skin: socks and collars are too few to tell from chance."""
 
 
 class _Rows(NamedTuple):
