@@ -259,7 +259,8 @@ class _Meeting(NamedTuple):
             rgb = voxels[:, cells, :, :3]
             by_design = torch.einsum("ncq,nkvc->kvq", x, rgb)
             parts.append((by_design, rgb.sum(0), rgb.square().sum((0, 3)), seen(voxels[:, cells]).sum(0)))
-        return cls(normal, *(sum(each) for each in zip(*parts, strict=True)), torch.tensor(len(design)))
+        by_design, total, square, weight = (torch.stack(each).sum(0) for each in zip(*parts, strict=True))
+        return cls(normal, by_design, total, square, weight, torch.tensor(len(design)))
 
     def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
         """How much of a voxel each surface is, and its tone."""
