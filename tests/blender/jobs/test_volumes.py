@@ -112,20 +112,6 @@ def test_the_first_picture_by_cycles_shows_the_human(person, tmp_path):
     assert max(list(picture.pixels)[3::4]) > 0.2
 
 
-@pytest.mark.parametrize("link", [False, True])
-def test_appended_or_linked_a_render_has_them(person, tmp_path, link):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=link) as (_, wanted):
-        wanted.collections = ["Human"]
-    bpy.context.scene.collection.children.link(bpy.data.collections["Human"])
-    write_before_rendering(bpy.context.scene)
-    (human,) = humans(bpy.context.scene)
-    assert are_written(human)
-    volumes_of(human).hide_viewport = False
-    assert drawn() == COUNT
-
-
 def test_a_copy_renders_what_is_written_for_both(person):
     twin = copy_of(person)
     write_before_rendering(bpy.context.scene)

@@ -15,7 +15,7 @@ from support import tensor_files
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import BETAS, MARK, body_of, human_of, humans, parts_of, state_of
+from blender_primdiffusion.scene.human import BETAS, MARK, body_of, human_of, parts_of, state_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 COUNT = 12
@@ -82,23 +82,6 @@ def test_the_state_is_told_apart_by_what_it_holds(person, saved_scene, tmp_path)
     assert edited != before
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
     assert state_of(person) == edited
-
-
-def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
-    bpy.ops.ed.undo_push(message="before")
-    before = folder_of(person)
-    replace(person, redyed(tmp_path, 3))
-    after = folder_of(person)
-    bpy.ops.ed.undo_push(message="edit")
-    bpy.ops.ed.undo()
-    (person,) = humans(bpy.context.scene)
-    assert folder_of(person) == before
-    assert first(person)
-    assert len(evaluated_matrices(person)) == COUNT
-    bpy.ops.ed.redo()
-    (person,) = humans(bpy.context.scene)
-    assert folder_of(person) == after
-    assert not first(person)
 
 
 def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved_scene, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import psutil
 import pytest
 import synthetic_shape
-from human_files import forget_session_files, person_file, press_x
+from human_files import forget_session_files, held, person_file, press_x
 from human_stage import named, places, whole
 from support.errors import refused
 from support.fake_child import request_of
@@ -62,12 +62,14 @@ def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(sourc
     assert request_of(person_file(person))["seed"] == 7
 
 
-def test_appended_people_are_whole_and_can_be_edited(person, tmp_path):
+def test_appended_people_are_whole_and_can_be_edited(person, content, tmp_path):
     where, other = places(person), tmp_path / "other"
     other.mkdir()
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(other / "film.blend"))
     bpy.ops.wm.append(directory=str(tmp_path / "shot.blend" / "Collection") + os.sep, filename="Anna")
+    forget_session_files()
+    assert held(named()) == content
     assert whole(named(), where)
     assert ops.vary(human="Anna", seed=13) == {"FINISHED"}
     assert whole(named(), where)
@@ -88,9 +90,11 @@ def linked(tmp_path, folder="other"):
     return bpy.data.objects["Anna"]
 
 
-def test_linked_people_are_whole_and_reject_edits(person, tmp_path):
+def test_linked_people_are_whole_and_reject_edits(person, content, tmp_path):
     where = places(person)
     anna = linked(tmp_path)
+    forget_session_files()
+    assert held(anna) == content
     assert whole(anna, where)
     for operator in (ops.vary, ops.reshape):
         with refused(RuntimeError, "linked"):
@@ -100,7 +104,7 @@ def test_linked_people_are_whole_and_reject_edits(person, tmp_path):
     assert whole(named(), where)
 
 
-def test_linked_people_with_overrides_can_be_posed_and_made_local(person, tmp_path):
+def test_linked_people_with_overrides_can_be_posed(person, content, tmp_path):
     linked(tmp_path)
     made = bpy.data.collections["Anna"].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
     override = next(filter(is_human, made.all_objects))
@@ -114,6 +118,7 @@ def test_linked_people_with_overrides_can_be_posed_and_made_local(person, tmp_pa
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     override = next(one for one in humans(bpy.context.scene) if one.library is None)
+    assert held(override) == content
     assert whole(override, where)
 
 

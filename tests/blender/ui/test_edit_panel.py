@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from human_files import paths_of, person_file, remove_human
-from jobs_driven import drive, error_of, notice_of, shown, until_running
+from human_files import paths_of, person_file
+from jobs_driven import drive, notice_of, shown, until_running
 from support.errors import refused
-from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
+from support.fake_child import TAKES_LONG, request_of
 from support.tensor_files import read_tensors
 
 from blender_primdiffusion.jobs.generate import EditJob
@@ -165,83 +165,6 @@ def test_a_vertex_group_that_is_not_there_is_named(person):
         ops.redress(seed=FINE)
     with refused(ValueError, "sleeve"):
         painted_weights(body_of(person), "sleeve")
-
-
-@pytest.mark.parametrize(
-    ("seed", "sentence"),
-    [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "contains no human")],
-)
-def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, seed, sentence):
-    before, file, files = paths_of(person), person_file(person), sorted(person_file(person).parent.iterdir())
-    with pytest.raises(RuntimeError, match=sentence) as caught:
-        ops.vary(seed=seed)
-    assert str(caught.value).count("Error:") == 1
-    assert (paths_of(person), person_file(person)) == (before, file)
-    assert sorted(file.parent.iterdir()) == files
-    assert not list(Path(bpy.app.tempdir).glob("vary_*"))
-    assert sentence in drawn("VARY").replace(" | ", " ")  # lines are wrapped
-    assert sentence not in drawn("REDRESS")
-
-
-@pytest.mark.parametrize("by_hand", [False, True], ids=["human removed", "objects deleted by hand"])
-def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person, by_hand):
-    _, other = humans(bpy.context.scene)
-    before = paths_of(other)
-    start(person)
-    until_running()
-    if by_hand:
-        bpy.data.batch_remove(list(parts_of(person)))
-    else:
-        remove_human(person)
-    drive()
-    assert "'Human' was removed during the edit" in error_of("vary")
-    assert paths_of(other) == before
-    assert not queue.busy
-
-
-def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
-    cube = bpy.data.objects.new("cube", None)
-    bpy.context.scene.collection.objects.link(cube)
-    bpy.ops.ed.undo_push(message="cube")
-    before = paths_of(person)
-    start(person)
-    until_running()
-    bpy.ops.ed.undo()
-    drive()
-    assert error_of("vary") == ""
-    assert not set(paths_of(humans(bpy.context.scene)[0])) & set(before)
-
-
-def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(addon, tmp_path):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    ops.generate(seed=7)
-    (person,) = humans(bpy.context.scene)
-    start(person)
-    until_running()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
-    person.name = "Anna"
-    drive()
-    assert error_of("vary") == ""
-    assert sent(person)["seed"] == FINE
-
-
-@pytest.mark.parametrize("part", ["armature", "body", "cube"])
-def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, part):
-    cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
-    bpy.context.scene.collection.objects.link(cube)
-    body_of(person).hide_viewport = False
-    obj = {"armature": person, "body": body_of(person), "cube": cube}[part]
-    bpy.context.view_layer.objects.active = obj
-    bpy.ops.ed.undo_push(message="before")
-    before = paths_of(person)
-    start(person)
-    bpy.ops.object.mode_set(mode="EDIT")
-    drive()
-    assert error_of("vary") == ""
-    assert bpy.context.mode == "OBJECT"
-    assert not set(paths_of(person)) & set(before)
-    bpy.ops.ed.undo()
-    assert paths_of(humans(bpy.context.scene)[0]) == before
 
 
 def test_locked_hidden_people_are_edited(person):
