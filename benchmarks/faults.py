@@ -10,7 +10,7 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
   the human, relative to the range of its kind; threads: of how many numbers of threads (1, 2, 3) the files of a
   generated human and a variant have the same bytes (`tests/backend/thread_bytes.py`)
 - blends: a stranger's names and paths in a .blend: how many properties were tried, and how many files they changed
-  outside of the folder beside it (`tests/blender/blend_tampering.py`)
+  outside of the folder beside it (`tests/blender/test_hostile_blends.py`)
 - attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
   tests in ATTACKS: how many there are, and how many did no harm
 - rigs: motions and scans of the default body as a Mixamo, Ready Player Me, Rokoko, VRoid and SOMA rig: how many are
@@ -149,11 +149,23 @@ def numbers(human: Human) -> dict[str, torch.Tensor]:
     return {name: tensor.double() for name, tensor in tensors.items() if tensor.max() > tensor.min()}
 
 
-def attacks() -> dict[str, Figure]:
-    """The attacks that were tried, and those that did no harm. Ends with a sentence where a test is gone."""
-    said = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *ATTACKS, is_shown=False).splitlines()[-1]
+def tried_and_held(*words: str) -> tuple[int, int]:
+    """Tests that ran, and those that passed. Ends with a sentence where a test is gone."""
+    said = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *words, is_shown=False).splitlines()[-1]
     counts = {outcome: int(number) for number, outcome in re.findall(r"(\d+) (passed|failed|errors?)", said)}
-    return {"attack_cases": sum(counts.values()), "attack_cases_held": counts.get("passed", 0)}
+    return sum(counts.values()), counts.get("passed", 0)
+
+
+def attacks() -> dict[str, Figure]:
+    """The attacks that were tried, and those that did no harm."""
+    return dict(zip(PARTS["attacks"].figures, tried_and_held(*ATTACKS), strict=True))
+
+
+def blends() -> dict[str, Figure]:
+    """Properties of a stranger's .blend that were tried with each value, and those by which a file was written."""
+    words = ("tests/blender/test_hostile_blends.py", "-m", "slow", "-k", "no_value_of_a_property")
+    tried, held = tried_and_held(*words)
+    return dict(zip(PARTS["blends"].figures, (tried, tried - held), strict=True))
 
 
 def window(path: Path) -> dict[str, Figure]:
@@ -198,10 +210,7 @@ PARTS: dict[str, Part] = {
     "threads": Part(
         ("same_bytes_threads",), lambda given: tool("tests/backend/thread_bytes.py", "--steps", str(given.steps))
     ),
-    "blends": Part(
-        ("blend_properties_tried", "files_written_outside"),
-        lambda _: tool("tests/blender/blend_tampering.py", is_shown=False),
-    ),
+    "blends": Part(("blend_properties_tried", "files_written_outside"), lambda _: blends()),
     "attacks": Part(("attack_cases", "attack_cases_held"), lambda _: attacks()),
     "rigs": Part(
         ("real_rigs", "real_rigs_read", "real_rigs_upright", "capture_scale_error_max"),

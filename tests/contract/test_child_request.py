@@ -109,48 +109,6 @@ def test_an_error_of_the_backend_becomes_the_requests_error(start, settings, kin
     assert request.message == str(request.error)
 
 
-def test_a_missing_python_is_the_requests_error(tmp_path):
-    def nowhere():
-        raise BackendNotFound("No Python for the backend: name one in the preferences.")
-
-    request = generate_request(Backend(nowhere), seed=1, steps=1, out_dir=tmp_path / "out")
-    assert follow(request) == ["starting", "failed"]
-    assert request.error.kind == "environment"
-    assert str(request.error) == "No Python for the backend: name one in the preferences."
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        (
-            "echo \"ModuleNotFoundError: No module named 'primdiffusion'\" >&2; exit 1",
-            "No module named 'primdiffusion'",
-        ),
-        ("echo hello", "hello"),
-    ],
-)
-def test_a_python_that_cannot_run_the_backend_is_named_with_its_reason_and_what_to_do(tmp_path, text, reason):
-    python = tmp_path / "python"
-    python.write_text(f"#!/bin/sh\n{text}\n")
-    python.chmod(0o755)
-    request = generate_request(Backend(lambda: BackendClient(python)), seed=1, steps=1, out_dir=tmp_path / "out")
-    assert follow(request)[-1] == "failed"
-    assert request.error.kind == "environment"
-    assert f"{python} cannot run the backend: " in str(request.error)
-    assert reason in str(request.error)
-    assert "Name a Python 3.11" in str(request.error)
-
-
-def test_a_python_that_is_not_there_is_named_with_what_to_do(tmp_path):
-    for python in (tmp_path / "no-python", tmp_path):
-        request = generate_request(
-            Backend(lambda at=python: BackendClient(at)), seed=1, steps=1, out_dir=tmp_path / "out"
-        )
-        assert follow(request) == ["starting", "failed"]
-        assert str(python) in str(request.error)
-        assert "Name a Python 3.11" in str(request.error)
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")
 def test_a_child_that_hangs_is_ended_and_fails_the_request(slow_checkpoint, tmp_path):
     backend = this_pythons_backend()
@@ -177,3 +135,35 @@ def test_a_cancel_while_torch_is_loaded_keeps_the_child(checkpoint, tmp_path):
     assert follow(again)[-1] == "done"
     assert backend.client is first is not None
     backend.shutdown()
+
+
+def script(path: Path, text: str) -> Path:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def nowhere(_folder: Path) -> BackendClient:
+    raise BackendNotFound("No Python for the backend: name one in the preferences.")
+
+
+@pytest.mark.parametrize(
+    ("python", "reasons"),
+    [
+        (nowhere, ["No Python for the backend: name one in the preferences."]),
+        (lambda folder: script(folder / "python", "echo \"No module named 'primdiffusion'\" >&2; exit 1"),
+         ["cannot run the backend: ", "No module named 'primdiffusion'", "Name a Python 3.11"]),
+        (lambda folder: script(folder / "python", "echo hello"),
+         ["cannot run the backend: ", "hello", "Name a Python 3.11"]),
+        (lambda folder: folder / "no-python", ["Name a Python 3.11"]),
+        (lambda folder: folder, ["Name a Python 3.11"]),
+    ],
+    ids=["none", "without the backend", "talks", "missing", "a folder"],
+)  # fmt: skip
+def test_a_python_that_does_not_run_the_backend_is_named_with_what_to_do(tmp_path, python, reasons):
+    backend = Backend(lambda: BackendClient(python(tmp_path)))
+    request = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "out")
+    assert follow(request)[-1] == "failed"
+    assert request.error.kind == "environment"
+    assert all(reason in str(request.error) for reason in reasons)
+    assert python is nowhere or str(tmp_path) in str(request.error)

@@ -40,11 +40,6 @@ def test_shutdown_ends_the_child_without_a_died_event(client):
     client.shutdown()
 
 
-def test_starting_a_python_that_is_not_there_raises(tmp_path):
-    with pytest.raises(OSError, match="no-such-python"):
-        BackendClient(tmp_path / "no-such-python").start()
-
-
 def test_a_child_that_dies_at_once_reports_its_exit_code_and_last_words(fake_child):
     client = fake_child("""
         print("libtorch is missing", file=sys.stderr)

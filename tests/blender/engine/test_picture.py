@@ -21,11 +21,12 @@ from engine_stage import (
 )
 from human_files import lose_data, remove_human
 from mathutils import Euler, Matrix
-from oracle import raised
+from oracle import raised, world_from_model
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.human_file import read_human
+from blender_primdiffusion.scene.human_file import read_human, shape_model_of
+from blender_primdiffusion.scene.shape import betas_of
 
 SIZE = (120, 90)
 REST = np.tile(np.eye(3), (24, 1, 1))
@@ -370,3 +371,27 @@ def test_undo_and_frame_changes_do_not_disturb_the_engine(stage, backend):
     bpy.ops.ed.undo()
     bpy.context.scene.frame_set(1)
     assert_same(render_png(stage.out), wanted)
+
+
+def test_the_engine_draws_a_reshaped_posed_person_as_the_backend_does(stage, backend):
+    armature = stage.person
+    rng = np.random.default_rng(2)
+    rotations, translation = synthetic.axis_angle(rng.normal(0, 0.3, (24, 3))), np.array([0.1, 0.05, 0.0])
+    pose_from_joint_rotations(armature, rotations, translation)
+    armature.primdiffusion_human.betas = [1.5, -2.0, 1.0, 0, 0, 1.0, 0, 0, 0, 0]
+    armature.primdiffusion_human.height = 1.82
+    bpy.context.view_layer.update()
+    body = shape_model_of(stage.person).surface(betas_of(stage.person))
+    asked = {
+        "folder": str(backend.folders[0]),
+        "rotations": rotations.tolist(),
+        "translation": translation.tolist(),
+        "world": (Z_UP.T @ world_from_model(armature, body) @ Z_UP).tolist(),
+        "betas": betas_of(stage.person).tolist(),
+    }
+    combined, _ = backend.oracle.picture([asked], camera_by_hand(stage.camera, SIZE), SIZE)
+    wanted = eight_bit(combined)
+    assert 0.02 < (wanted[..., 3] > 0).mean() < 0.98
+    assert np.abs(render_png(stage.out) - wanted).max() <= 1
+    as_generated, _ = backend.oracle.picture([{**asked, "betas": [0.0] * 10}], camera_by_hand(stage.camera, SIZE), SIZE)
+    assert np.abs(eight_bit(as_generated) - wanted).max() > 30

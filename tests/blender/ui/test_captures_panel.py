@@ -307,18 +307,3 @@ def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
     assert [view.position.round(4).tolist() for view in settings.cameras] == [[2, 0.5, 4], [1, 0.5, 4]]
     assert settings.camera_count == 2
     assert (settings.cameras[0].width, settings.cameras[0].height) == (80, 60)
-
-
-def test_hostile_camera_files_are_rejected(tmp_path):
-    path = tmp_path / "cameras.json"
-    eye, twice = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[2, 0, 0], [0, 1, 0], [0, 0, 1]]
-    stretched = json.dumps({"a": {"K": eye, "R": twice, "T": [0, 0, 0]}})
-    for content in ("[]", "{}", "no json", '{"a": {"K": 1}}', stretched):
-        path.write_text(content)
-        with refused(ValueError, "cameras.json"):
-            settings_of(parse(["--out", "a", "--camera-file", str(path)]))
-
-
-def test_unknown_options_are_rejected():
-    with refused(ValueError, "--rm"):
-        parse(["--out", "a", "--rm", "-rf"])
