@@ -106,14 +106,6 @@ def test_a_broken_field_is_named_in_one_sentence(tmp_path, name):
         read_human(path)
 
 
-def test_a_deeply_nested_provenance_is_rejected(tmp_path):
-    path = synthetic.write(tmp_path, 4)
-    arrays, metadata = tensor_files.read_tensors(path)
-    tensor_files.write_tensors(path, arrays, {**metadata, "provenance": "[" * 100_000})
-    with refused(ValueError, path.name):
-        read_human(path)
-
-
 def test_a_missing_or_damaged_body_or_that_of_another_is_named(tmp_path):
     with refused(FileNotFoundError, "nobody.human"):
         read_human(tmp_path / "nobody.human")

@@ -12,6 +12,7 @@ from human_stage import named, places, whole
 from support.errors import refused
 from support.fake_child import request_of
 
+from blender_primdiffusion.jobs.parts import complete_humans
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import humans, is_human, parts_of
 
@@ -94,6 +95,7 @@ def test_linked_people_are_whole_and_reject_edits(person, content, tmp_path):
     where = places(person)
     anna = linked(tmp_path)
     forget_session_files()
+    assert not complete_humans(), "it stays as it is"
     assert held(anna) == content
     assert whole(anna, where)
     for operator in (ops.vary, ops.reshape):
@@ -194,8 +196,8 @@ def test_edits_do_not_pile_up_grids(source, monkeypatch):
     ops.volumes_in_viewport()
     ops.vary(seed=11)
     before = psutil.Process().memory_info().rss
-    for seed in (12, 13, 14):
+    for seed in (12, 13):
         ops.vary(seed=seed)
         bpy.context.view_layer.update()
     grown = (psutil.Process().memory_info().rss - before) / 1e6
-    assert grown < 60, f"three edits of 64 grids of 0.9 MB: {grown:.0f} MB more"
+    assert grown < 50, f"two edits of 64 grids of 0.9 MB: {grown:.0f} MB more"

@@ -110,15 +110,6 @@ def test_an_armature_appended_alone_becomes_whole(person, tmp_path):
     assert whole(named(), where)
 
 
-def test_linked_humans_and_overrides_stay_as_they_are(person, tmp_path):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
-        wanted.objects = ["Anna"]
-    bpy.context.scene.collection.objects.link(wanted.objects[0])
-    assert not complete_humans()
-
-
 def test_a_copy_whose_data_are_damaged_is_told_and_left(person, capsys):
     person.select_set(True)
     bpy.context.view_layer.objects.active = person

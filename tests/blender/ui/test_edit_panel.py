@@ -16,8 +16,8 @@ from support.tensor_files import read_tensors
 
 from blender_primdiffusion.jobs.generate import EditJob
 from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.edit import painted_weights
 from blender_primdiffusion.scene.human import body_of, humans, parts_of
 from blender_primdiffusion.ui import edit_panel
 
@@ -32,10 +32,9 @@ pytestmark = pytest.mark.any_blender
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
     """Somebody at work on whom there is to edit, and somebody else, in a saved file."""
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
-    for _ in range(2):
-        ops.generate(seed=7)
-    first, _ = humans(addon.scene)
+    file = synthetic_shape.write(tmp_path / "prepared", COUNT)
+    monkeypatch.setenv("FAKE_HUMAN", str(file))
+    first, _ = build_human(addon, file), build_human(addon, file)
     addon.view_layer.objects.active = first
     bpy.ops.ed.undo_push(message="two people")
     return first
@@ -112,7 +111,10 @@ def test_a_script_sets_what_the_panel_shows(person):
 def test_a_blend_moves_the_body_where_the_betas_differ(person):
     betas = read_tensors(person_file(person))[0]["betas"].astype(np.float64)
     settings().other, settings().fraction = humans(bpy.context.scene)[1], 0.75
-    assert ops.blend() == {"FINISHED"}
+    for obj in list(parts_of(person)):
+        obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
+        obj.hide_select = obj.hide_viewport = True
+    assert ops.blend(human="Human") == {"FINISHED"}, "locked and hidden, too"
     asked = sent(person)
     assert (asked["other"], asked["fraction"]) == (str(person_file(humans(bpy.context.scene)[1])), 0.75)
     heads = np.array([person.data.bones[name].head_local for name in synthetic.NAMES])
@@ -130,17 +132,17 @@ def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
     assert sent(other)["seed"] == FINE
     ops.vary(human="Human", seed=FINE + 1)
     assert sent(person)["seed"] == FINE + 1
-
-
-def test_an_edit_of_an_edit_starts_from_the_edited_person(person):
-    ops.vary(seed=FINE)
     edited = person_file(person)
-    ops.vary(seed=FINE + 1)
-    assert sent(person)["person"] == str(edited)
+    ops.vary(human="Human", seed=FINE)
+    assert sent(person)["person"] == str(edited), "an edit of an edit starts from the edited person"
 
 
 def test_a_painted_region_travels_as_weights_of_all_vertices(person):
     body = body_of(person)
+    settings().region, settings().vertex_group = "PAINTED", "sleeve"
+    with refused(RuntimeError, "sleeve"):
+        ops.redress(seed=FINE)
+    settings().property_unset("vertex_group")
     assert ops.paint_region() == {"FINISHED"}
     assert (body.mode, bpy.context.object, body.hide_viewport) == ("WEIGHT_PAINT", body, False)
     assert settings().region == "PAINTED"
@@ -159,28 +161,7 @@ def test_a_painted_region_travels_as_weights_of_all_vertices(person):
         ops.paint_region(finish=True)
 
 
-def test_a_vertex_group_that_is_not_there_is_named(person):
-    settings().region, settings().vertex_group = "PAINTED", "sleeve"
-    with refused(RuntimeError, "sleeve"):
-        ops.redress(seed=FINE)
-    with refused(ValueError, "sleeve"):
-        painted_weights(body_of(person), "sleeve")
-
-
-def test_locked_hidden_people_are_edited(person):
-    for obj in list(parts_of(person)):
-        obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
-        obj.hide_select = obj.hide_viewport = True
-    before = paths_of(person)
-    settings().other = humans(bpy.context.scene)[1]
-    assert ops.blend(human="Human") == {"FINISHED"}
-    assert not set(paths_of(person)) & set(before)
-
-
-def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tmp_path):
-    assert not ops.vary.poll()
-    for _ in range(2):
-        ops.generate(seed=7)
+def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(person, addon):
     addon.view_layer.objects.active = None
     settings().parts = set()
     rejected = {
@@ -196,6 +177,8 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
     settings().other = humans(addon.scene)[0]
     with refused(RuntimeError, "'Human' cannot be the other human too"):
         ops.blend(human="Human")
+    bpy.data.batch_remove(list(bpy.data.objects))
+    assert not ops.vary.poll()
 
 
 def test_each_edit_shows_only_its_own_job_and_cancels_it(person):
