@@ -14,7 +14,7 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
 - attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
   tests in ATTACKS: how many there are, and how many did no harm
 - rigs: motions and scans of the default body as a Mixamo, Ready Player Me, Rokoko, VRoid and SOMA rig: how many are
-  read and stand, and the largest error of a scan's size as a fraction (`tests/blender/real_rigs.py`)
+  read and stand, and the largest error of a scan's size as a fraction (`benchmarks/real_rigs.py`)
 - window: rounds of undo and redo among timers in a real window, and crashes, from the figures of
   `scripts/window/look.py --scenes undo_and_timers`; left out without --window
 """
@@ -214,7 +214,7 @@ PARTS: dict[str, Part] = {
     "attacks": Part(("attack_cases", "attack_cases_held"), lambda _: attacks()),
     "rigs": Part(
         ("real_rigs", "real_rigs_read", "real_rigs_upright", "capture_scale_error_max"),
-        lambda _: tool("tests/blender/real_rigs.py", is_shown=False),
+        lambda _: tool("benchmarks/real_rigs.py", is_shown=False),
     ),
     "window": Part(("window_rounds", "window_crashes"), lambda given: window(given.window)),
 }

@@ -14,7 +14,7 @@ from blender_primdiffusion.formats.camera_rig import bounding_sphere
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rigs import RIGS, map_bones
 from blender_primdiffusion.formats.poses.rotation import about_axis
-from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load, own_person
+from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load
 from support.errors import refused
 
 from blender_primdiffusion.capture.scan import Scan
@@ -84,6 +84,23 @@ def test_bounds_are_those_of_what_blender_draws(tmp_path, empty_scene):
     np.testing.assert_allclose(outermost.min(0), seen.min(0), atol=2e-5)
     np.testing.assert_allclose(outermost.max(0), seen.max(0), atol=2e-5)
     np.testing.assert_allclose(bounding_sphere(outermost)[1], bounding_sphere(seen)[1], atol=2e-5)
+
+
+def own_person(path: Path) -> Path:
+    """A .glb as the backend writes people: SMPL's joints at rest, betas in the extras."""
+    scan_fixtures.person(BODY, BETAS)
+    scan_fixtures.save(path)
+    content = path.read_bytes()
+    length = struct.unpack("<I", content[12:16])[0]
+    about = json.loads(content[20 : 20 + length])
+    about["asset"]["extras"] = {"primdiffusion": {"betas": BETAS.tolist(), "body": "default", "seed": 3}}
+    written = json.dumps(about).encode()
+    written += b" " * (-len(written) % 4)
+    rest = content[20 + length :]
+    path.write_bytes(
+        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(written) + len(rest), len(written), b"JSON") + written + rest
+    )
+    return path
 
 
 def test_our_own_people_are_posed_exactly(tmp_path, empty_scene):
