@@ -45,7 +45,6 @@ THREADS = (1, 2, 4)
 BATCHES = (1, 8)
 ATTACKS = (
     "tests/contract/test_setup_environment.py::test_only_whole_lines_of_a_requirement_or_an_index_are_read",
-    "tests/contract/test_setup_environment.py::test_a_second_index_is_refused",
     "tests/contract/test_setup_environment.py::test_pip_gets_no_line_that_was_not_read",
     "tests/backend/capture/test_farm.py::test_a_subject_that_would_be_an_option_or_a_path_is_handed_to_no_renderer",
     "tests/backend/capture/test_render.py::test_no_worker_writes_through_a_link_in_the_folder_of_a_human",
