@@ -10,11 +10,11 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
   the human, relative to the range of its kind; threads: of how many numbers of threads (1, 2, 3) the files of a
   generated human and a variant have the same bytes (`tests/backend/thread_bytes.py`)
 - blends: a stranger's names and paths in a .blend: how many properties were tried, and how many files they changed
-  outside of the folder beside it (`tests/blender/blend_tampering.py`)
+  outside of the folder beside it (`tests/blender/test_hostile_blends.py`)
 - attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
   tests in ATTACKS: how many there are, and how many did no harm
 - rigs: motions and scans of the default body as a Mixamo, Ready Player Me, Rokoko, VRoid and SOMA rig: how many are
-  read and stand, and the largest error of a scan's size as a fraction (`tests/blender/real_rigs.py`)
+  read and stand, and the largest error of a scan's size as a fraction (`benchmarks/real_rigs.py`)
 - window: rounds of undo and redo among timers in a real window, and crashes, from the figures of
   `scripts/window/look.py --scenes undo_and_timers`; left out without --window
 """
@@ -45,7 +45,6 @@ THREADS = (1, 2, 4)
 BATCHES = (1, 8)
 ATTACKS = (
     "tests/contract/test_setup_environment.py::test_only_whole_lines_of_a_requirement_or_an_index_are_read",
-    "tests/contract/test_setup_environment.py::test_a_second_index_is_refused",
     "tests/contract/test_setup_environment.py::test_pip_gets_no_line_that_was_not_read",
     "tests/backend/capture/test_farm.py::test_a_subject_that_would_be_an_option_or_a_path_is_handed_to_no_renderer",
     "tests/backend/capture/test_render.py::test_no_worker_writes_through_a_link_in_the_folder_of_a_human",
@@ -149,11 +148,23 @@ def numbers(human: Human) -> dict[str, torch.Tensor]:
     return {name: tensor.double() for name, tensor in tensors.items() if tensor.max() > tensor.min()}
 
 
-def attacks() -> dict[str, Figure]:
-    """The attacks that were tried, and those that did no harm. Ends with a sentence where a test is gone."""
-    said = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *ATTACKS, is_shown=False).splitlines()[-1]
+def tried_and_held(*words: str) -> tuple[int, int]:
+    """Tests that ran, and those that passed. Ends with a sentence where a test is gone."""
+    said = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *words, is_shown=False).splitlines()[-1]
     counts = {outcome: int(number) for number, outcome in re.findall(r"(\d+) (passed|failed|errors?)", said)}
-    return {"attack_cases": sum(counts.values()), "attack_cases_held": counts.get("passed", 0)}
+    return sum(counts.values()), counts.get("passed", 0)
+
+
+def attacks() -> dict[str, Figure]:
+    """The attacks that were tried, and those that did no harm."""
+    return dict(zip(PARTS["attacks"].figures, tried_and_held(*ATTACKS), strict=True))
+
+
+def blends() -> dict[str, Figure]:
+    """Properties of a stranger's .blend that were tried with each value, and those by which a file was written."""
+    words = ("tests/blender/test_hostile_blends.py", "-m", "slow", "-k", "no_value_of_a_property")
+    tried, held = tried_and_held(*words)
+    return dict(zip(PARTS["blends"].figures, (tried, tried - held), strict=True))
 
 
 def window(path: Path) -> dict[str, Figure]:
@@ -198,14 +209,11 @@ PARTS: dict[str, Part] = {
     "threads": Part(
         ("same_bytes_threads",), lambda given: tool("tests/backend/thread_bytes.py", "--steps", str(given.steps))
     ),
-    "blends": Part(
-        ("blend_properties_tried", "files_written_outside"),
-        lambda _: tool("tests/blender/blend_tampering.py", is_shown=False),
-    ),
+    "blends": Part(("blend_properties_tried", "files_written_outside"), lambda _: blends()),
     "attacks": Part(("attack_cases", "attack_cases_held"), lambda _: attacks()),
     "rigs": Part(
         ("real_rigs", "real_rigs_read", "real_rigs_upright", "capture_scale_error_max"),
-        lambda _: tool("tests/blender/real_rigs.py", is_shown=False),
+        lambda _: tool("benchmarks/real_rigs.py", is_shown=False),
     ),
     "window": Part(("window_rounds", "window_crashes"), lambda given: window(given.window)),
 }

@@ -3,7 +3,7 @@
 import torch
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.primitives.primitives import Frames, Primitives
+from primdiffusion.primitives.primitives import Primitives
 from torch import Tensor
 
 
@@ -48,16 +48,3 @@ def camera_at(position: tuple[float, ...], *, fov: float = 0.3, width: int = 24,
     """A camera that looks at the origin."""
     where = torch.tensor(position, dtype=torch.float64)
     return look_at(where, torch.zeros_like(where), vertical_fov=fov, width=width, height=height)
-
-
-def single_ray(distance: float) -> Camera:
-    """One pixel whose ray runs along -z through the origin, from `distance` in front of it."""
-    return camera_at((0.0, 0.0, distance), width=1, height=1)
-
-
-def sheet_frames(side: int) -> Frames:
-    """side x side overlapping boxes in a plane, all facing +z."""
-    line = (torch.arange(side) - (side - 1) / 2) * 0.05
-    y, x = torch.meshgrid(line, line, indexing="ij")
-    position = torch.stack([x.flatten(), y.flatten(), torch.zeros(side**2)], dim=-1)
-    return Frames(position, torch.eye(3).expand(side**2, 3, 3).clone(), torch.full((side**2, 3), 0.045))

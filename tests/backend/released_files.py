@@ -1,18 +1,12 @@
 """A checkpoint with the names and shapes of the authors', and a body in SMPL's format, made of numbers of our own."""
 
-import json
 import pickle
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 import torch
-from PIL import Image
-from primdiffusion.body.smpl_files import load_body
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
-from primdiffusion.formats.capture_layout import picture_path
-from primdiffusion.geometry.camera import look_at
-from primdiffusion.raster.z_buffer import nearest_triangles
 from torch import Tensor
 
 T = 1000
@@ -214,36 +208,3 @@ def save_body(folder: Path) -> tuple[Path, Path]:
 
 def template() -> Tensor:
     return torch.from_numpy(np.asarray(body_arrays()["v_template"])).float()
-
-
-def save_capture(root: Path, name: str = "someone", size: int = 48, cameras: int = 4) -> Path:
-    """A dataset of the drum in the released layout, grey by its normals, in two frames; returns its subject."""
-    body, folder = load_body(root / "SMPL_NEUTRAL.pkl", root / "smpl_uv.obj"), root / "captures" / name
-    (folder / "outputs_re_fitting").mkdir(parents=True)
-    (folder.parent / "release_human_list.txt").write_text(f"{name}\n")
-    corners = body.template[body.faces].double().numpy()
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    grey = np.clip(128 + 100 * normals @ [0.6, 0.0, 0.8] / np.linalg.norm(normals, axis=1), 0, 255).astype(np.uint8)
-    rig = {}
-    for number in range(cameras):
-        yaw = 2 * np.pi * number / cameras
-        position = torch.tensor([3 * np.sin(yaw), 0.2, 3 * np.cos(yaw)]).float()
-        camera = look_at(position, torch.zeros(3), vertical_fov=0.8, width=size, height=size)
-        world = camera.world_to_camera.double().numpy()
-        rig[f"camera{number:04d}"] = {
-            "K": camera.intrinsics.double().tolist(), "R": world[:, :3].tolist(), "T": world[:, 3].tolist()
-        }  # fmt: skip
-        found = nearest_triangles(corners, camera).triangle
-        mask = np.where(found >= 0, 255, 0).astype(np.uint8)
-        for kind, pixels in (("img", np.where(found >= 0, grey[found], 0)[..., None].repeat(3, -1)), ("mask", mask)):
-            for frame in range(2):
-                path = picture_path(folder, kind, number, frame)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                Image.fromarray(pixels.astype(np.uint8)).save(path)
-    (folder / "cameras.json").write_text(json.dumps(rig))
-    parameters = {
-        "global_orient": np.zeros((2, 3)), "body_pose": np.zeros((2, 69)), "betas": np.zeros((1, 10)),
-        "transl": np.zeros((2, 3)),
-    }  # fmt: skip
-    np.savez(folder / "outputs_re_fitting" / "refit_smpl_2nd.npz", smpl=np.array(parameters, dtype=object))
-    return folder

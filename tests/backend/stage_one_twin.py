@@ -124,13 +124,3 @@ def primitives(slab: Tensor, channels: int) -> Tensor:
     """[1, 8 C, 256, 256] as [K, C, D, H, W]."""
     parts = slab.view(8, channels, 32, 8, 32, 8)  # d c ny h nx w
     return torch.einsum("dcyhxw->yxcdhw", parts).reshape(1024, channels, 8, 8, 8)
-
-
-def resized(texture: Tensor) -> Tensor:
-    """A texture [3, 512, 512] at 256 x 256: bilinear, corner texels map to corner texels."""
-    at = torch.arange(256).double() * (511 / 255)
-    low = at.long().clamp(max=510)
-    share = at - low
-    x = texture.double()
-    x = x[:, low] * (1 - share)[:, None] + x[:, low + 1] * share[:, None]
-    return x[..., low] * (1 - share) + x[..., low + 1] * share

@@ -1,7 +1,7 @@
 """Every name and path that the extension reads from a .blend or the preferences, each with values of an attacker.
 
-`figures` tries all of them: it saves, loads, draws all panels and runs the operators on files, and counts what was
-changed outside of the folder beside the .blend. The tests try one property at a time.
+`attempt` saves, loads, draws all panels and runs the operators on files, and tells what was changed outside of the
+folder beside the .blend.
 """
 
 import contextlib
@@ -10,13 +10,11 @@ import json
 import os
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import bpy
-import synthetic
 import synthetic_shape
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -357,32 +355,3 @@ def in_preferences() -> Iterator[None]:
         yield
     finally:
         addons.remove(addons.get(EXTENSION))
-
-
-def figures() -> dict[str, int]:
-    """`blend_properties_tried`, and `files_written_outside`: changes that any of their values made outside of the
-    folder beside the .blend. Takes some minutes; for a process of its own, in which the extension is not registered."""
-    import pytest
-    from backend_python import use_this_python
-    from support.fake_child import FAKE_CHILD
-
-    import blender_primdiffusion
-
-    outside = 0
-    with tempfile.TemporaryDirectory() as root, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FAKE_HUMAN", str(synthetic.write(Path(root) / "prepared", COUNT)))
-        use_this_python(patch, FAKE_CHILD)
-        bpy.ops.wm.read_factory_settings(use_empty=True)
-        blender_primdiffusion.register()
-        pristine = Stage(Path(root) / "pristine")
-        build(pristine)
-        with in_preferences():
-            for name in PROPERTIES:
-                for _, faults in tried(name, pristine, Path(root) / "case"):
-                    outside += sum("changed" in fault or "copy of the user's file" in fault for fault in faults)
-        blender_primdiffusion.unregister()
-    return {"blend_properties_tried": len(PROPERTIES), "files_written_outside": outside}
-
-
-if __name__ == "__main__":
-    print(json.dumps(figures()))

@@ -6,7 +6,7 @@ from pathlib import Path
 import bpy
 
 from blender_primdiffusion.jobs.parts import complete_humans
-from blender_primdiffusion.scene.human import PAYLOAD, parts_of, session_file, session_folder
+from blender_primdiffusion.scene.human import BODY, PAYLOAD, parts_of, session_file, session_folder
 from blender_primdiffusion.scene.volume_nodes import files_of
 
 
@@ -18,6 +18,11 @@ def person_file(person: bpy.types.Object) -> Path:
 def folder_of(person: bpy.types.Object) -> Path:
     """The folder of the human's files, volumes among them."""
     return session_file(person).parent
+
+
+def held(person: bpy.types.Object) -> tuple[bytes, bytes]:
+    """The human's file and its body's, as they are packed."""
+    return tuple(person[name].packed_file.data for name in (PAYLOAD, BODY))
 
 
 def paths_of(person: bpy.types.Object) -> list[Path]:

@@ -27,6 +27,15 @@ def until_running(seconds: float = 300.0) -> None:
         time.sleep(0.01)
 
 
+def until_ready(seconds: float = 300.0) -> None:
+    """Until the result is there, and built but for the step into the scene."""
+    end = time.monotonic() + seconds
+    while not queue.ready:
+        assert time.monotonic() < end
+        queue.tick()
+        time.sleep(0.005)
+
+
 def error_of(kind: str) -> str:
     """Why the last work of a kind failed; empty when it did not."""
     return queue.outcomes[kind].sentence

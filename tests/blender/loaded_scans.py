@@ -1,7 +1,5 @@
 """Scans on the default body, loaded, and how far their vertices are from it."""
 
-import json
-import struct
 from pathlib import Path
 
 import bpy
@@ -33,20 +31,3 @@ def distance_m(scan: Scan, vertices: np.ndarray) -> np.ndarray:
         tree.insert(point, number)
     tree.balance()
     return np.array([tree.find(point)[2] for point in scan_fixtures.evaluated(scan.objects)[::7]])
-
-
-def own_person(path: Path) -> Path:
-    """A .glb as the backend writes people: SMPL's joints at rest, betas in the extras."""
-    scan_fixtures.person(BODY, BETAS)
-    scan_fixtures.save(path)
-    content = path.read_bytes()
-    length = struct.unpack("<I", content[12:16])[0]
-    about = json.loads(content[20 : 20 + length])
-    about["asset"]["extras"] = {"primdiffusion": {"betas": BETAS.tolist(), "body": "default", "seed": 3}}
-    written = json.dumps(about).encode()
-    written += b" " * (-len(written) % 4)
-    rest = content[20 + length :]
-    path.write_bytes(
-        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(written) + len(rest), len(written), b"JSON") + written + rest
-    )
-    return path

@@ -60,12 +60,3 @@ def labels() -> Iterator[tuple[str, str]]:
         yield where, prop.name
         for item in getattr(prop, "enum_items_static", ()):
             yield f"{where}.{item.identifier}", item.name
-
-
-def tooltips() -> Iterator[tuple[str, str]]:
-    for cls in classes(bpy.types.Operator):
-        if "INTERNAL" not in cls.bl_options:
-            yield cls.__name__, rna(cls).description
-    for where, prop in properties():
-        if prop.type not in ("POINTER", "COLLECTION"):
-            yield where, prop.description

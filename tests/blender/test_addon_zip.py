@@ -2,16 +2,14 @@
 
 import hashlib
 import json
-import os
 import re
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from engine_stage import pixels
+from own_blender import report_of
 from support import kernels
 from support.errors import refused
 
@@ -94,16 +92,9 @@ def test_an_index_makes_the_folder_a_repository_that_offers_the_zip(archive, tmp
 
 
 def test_the_installed_zip_generates_and_renders_a_human_and_blender_exits(archive, checkpoint, tmp_path):
-    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
-    (tmp_path / "user").mkdir()
     kernels.share_with_installed(tmp_path / "user")
-    program = Path(__file__).parent / "installed_generate.py"
     blend, picture = tmp_path / "shot.blend", tmp_path / "picture.png"
-    command = [sys.executable, *map(str, (program, archive, checkpoint, blend, 7, 3, picture))]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500, cwd=tmp_path)
-    reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
-    assert reports, done.stdout[-3000:] + done.stderr[-3000:]
-    report = json.loads(reports[0].removeprefix("REPORT "))
+    report, done = report_of("installed_generate.py", archive, checkpoint, blend, 7, 3, picture, folder=tmp_path)
     assert report["outcome"] == ["FINISHED"]
     assert report["module"] == "bl_ext.user_default.primdiffusion"
     assert (report["volumes"], report["files"]) == (not SPLATS_AVAILABLE, 0), "no render has needed their files"

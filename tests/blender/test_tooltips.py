@@ -3,10 +3,11 @@
 import functools
 import inspect
 import re
+from collections.abc import Iterator
 
 import bpy
 import pytest
-from shown_words import classes, labels, properties, tooltips, ways
+from shown_words import classes, labels, properties, rna, ways
 
 pytestmark = pytest.mark.any_blender
 
@@ -27,6 +28,15 @@ def test_every_label_is_there_and_a_title(addon):
     missing = [where for where, label in labels() if not label and "_OT_" in where and "." not in where]
     assert not wrong, "\n".join(wrong)
     assert not missing, "\n".join(missing)
+
+
+def tooltips() -> Iterator[tuple[str, str]]:
+    for cls in classes(bpy.types.Operator):
+        if "INTERNAL" not in cls.bl_options:
+            yield cls.__name__, rna(cls).description
+    for where, prop in properties():
+        if prop.type not in ("POINTER", "COLLECTION"):
+            yield where, prop.description
 
 
 def test_every_tooltip_is_a_sentence_without_a_full_stop(addon):

@@ -1,16 +1,14 @@
 """The viewer's zip: no code that downloads, accepted by Blender; in it humans are opened, posed, reshaped, exported."""
 
 import ast
-import json
-import os
 import re
-import subprocess
 import sys
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from own_blender import report_of
 from support.errors import refused
 
 pytest.importorskip("torch", reason="the gallery's humans are made by the backend")
@@ -20,8 +18,6 @@ from primdiffusion.human_file import load_human, save_human
 
 import build_addon
 from blender_primdiffusion.backend.environment import NOT_INSTALLED
-
-PROGRAM = Path(__file__).parent / "installed_viewer.py"
 
 
 @pytest.fixture(scope="module")
@@ -82,19 +78,7 @@ def test_a_human_too_large_for_the_gallery_is_rejected(gallery, tmp_path):
 def used(archive, tmp_path_factory) -> tuple[dict, Path]:
     """What the viewer did in a Blender of its own without a backend, and the folder of its files."""
     folder = tmp_path_factory.mktemp("used")
-    return use(archive, folder), folder
-
-
-def use(archive: Path, folder: Path, *program: Path) -> dict:
-    """The report of installed_viewer.py."""
-    (folder / "user").mkdir()
-    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user")}
-    environment = {name: text for name, text in environment.items() if not name.startswith(("PYTHON", "PRIMDIFFUSION"))}
-    command = [sys.executable, *map(str, (PROGRAM, archive, folder, *program))]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500, cwd=folder)
-    reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
-    assert reports, done.stdout[-3000:] + done.stderr[-3000:]
-    return json.loads(reports[0].removeprefix("REPORT "))
+    return report_of("installed_viewer.py", archive, folder, folder=folder, bare=True)[0], folder
 
 
 def test_a_human_of_the_gallery_is_added_posed_and_reshaped_without_a_backend(used):
@@ -128,7 +112,7 @@ def test_what_needs_a_backend_is_not_shown_and_says_so_when_a_script_asks(used):
 @pytest.mark.slow
 def test_generate_runs_in_the_backend_that_pip_installed(archive, tmp_path):
     program = Path(sys.executable).with_name("primdiffusion")
-    report = use(archive, tmp_path, program)
+    report, _ = report_of("installed_viewer.py", archive, tmp_path, program, folder=tmp_path, bare=True)
     assert report["generated"] == [["FINISHED"], ["FINISHED"]]
     assert (report["provenance"], report["boxes"]) == ([7, 8], [1024, 1024])
     assert report["standing"] == [True, True]

@@ -8,8 +8,6 @@ from waiting import BACKEND
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.requests import Backend, ChildRequest
 
-_PICTURE_PX = 16
-
 
 def this_pythons_backend(**settings) -> Backend:
     """The real child on the Python that runs the tests; `settings` of the client."""
@@ -17,11 +15,7 @@ def this_pythons_backend(**settings) -> Backend:
     return Backend(lambda: BackendClient(Path(sys.executable), BACKEND, **settings))
 
 
-def _request(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> ChildRequest:
-    chosen = {} if checkpoint is None else {"checkpoint": str(checkpoint)}
-    return ChildRequest(backend, method, {**params, **chosen, "out_dir": str(out_dir)})
-
-
 def generate_request(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> ChildRequest:
     """A person from noise."""
-    return _request(backend, "generate", out_dir, checkpoint, size=_PICTURE_PX, **params)
+    chosen = {} if checkpoint is None else {"checkpoint": str(checkpoint)}
+    return ChildRequest(backend, "generate", {**params, **chosen, "out_dir": str(out_dir), "size": 16})

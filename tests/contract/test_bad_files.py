@@ -252,6 +252,7 @@ CLAIMS: dict[tuple[str, str], Callable[[Path], object]] = {
     ("BVH", "huge size"): replaced(b"Frames: ", b"Frames: 9999999999"),
     ("AMASS", "NaN"): lambda path: with_array(path, "poses", nan),
     ("AMASS", "wrong shape"): lambda path: with_array(path, "poses", lambda values: values[:, :9]),
+    ("AMASS", "huge size"): lambda path: with_member(path, "poses.npy", npy("(9999999999, 156)")),
     ("AMASS", "hostile member"): lambda path: with_member(path, "poses.npy", objects()),
     ("AMASS", "zip bomb"): lambda path: with_member(
         path, "poses.npy", npy("(84000, 156)", bytes(84000 * 156 * 8)), zipfile.ZIP_DEFLATED

@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 import pytest
 from packaging.requirements import Requirement
 from primdiffusion.files.regular_files import portable_name
+from support.errors import refused
 from support.fake_child import FAILS, FAKE_CHILD
 
 from scripts.setup import TARGETS
@@ -117,5 +118,5 @@ def test_the_page_is_served_to_this_machine_alone(checkpoint, monkeypatch):
 def test_the_example_of_the_child_passes_its_sentence_on(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(FAKE_CHILD))
     monkeypatch.setattr(sys, "argv", ["drive_the_child.py", "--out", str(tmp_path / "out"), "--seed", str(FAILS)])
-    with pytest.raises(SystemExit, match="the checkpoint is damaged"):
+    with refused(SystemExit, "the checkpoint is damaged"):
         runpy.run_path(str(EXAMPLES / "drive_the_child.py"), run_name="__main__")

@@ -40,11 +40,6 @@ def test_shutdown_ends_the_child_without_a_died_event(client):
     client.shutdown()
 
 
-def test_starting_a_python_that_is_not_there_raises(tmp_path):
-    with pytest.raises(OSError, match="no-such-python"):
-        BackendClient(tmp_path / "no-such-python").start()
-
-
 def test_a_child_that_dies_at_once_reports_its_exit_code_and_last_words(fake_child):
     client = fake_child("""
         print("libtorch is missing", file=sys.stderr)
@@ -129,7 +124,7 @@ def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
 
 def test_a_poll_ends_when_its_time_is_over_and_a_flood_loses_no_message(fake_child, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.backend.client.POLL_S", 0.0)
-    count = 20_000
+    count = 4000
     client = fake_child(f"""
         for i in range({count}):
             sys.stdout.write(json.dumps({{"jsonrpc": "2.0", "method": "news", "params": {{"i": i}}}}) + "\\n")
@@ -193,7 +188,7 @@ def open_files() -> int:
     return len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").is_dir() else 0
 
 
-@pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.slow)])
 def test_many_deaths_hang_nothing_and_leave_nothing_open(fake_child, count):
     before = open_files()
     die_often(fake_child, count)
@@ -282,10 +277,14 @@ def test_every_way_to_die_has_a_sentence():
         ({"method": "ready", "params": {"ready": "yes"}}, "ready"),
         ({"id": 99, "result": {}}, "id"),
         ({"id": None, "error": {"code": -32700, "message": "the line is not JSON"}}, "id"),
+        ('\'{"id": 1, "result": {"version"\'', "not JSON"),
+        ("'{' * 1000", "not JSON"),
+        ("'{\"id\": 1, \"result\": \"' + 'x' * 5_000_000 + '\"}'", "longer than 4 MB"),
     ],
 )
 def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message, fault):
-    client = fake_child(f"print({json.dumps(message)!r}, flush=True)\ntime.sleep(60)")
+    line = message if isinstance(message, str) else repr(json.dumps(message))
+    client = fake_child(f"print({line}, flush=True)\ntime.sleep(60)")
     died = wait_for(client, lambda e: isinstance(e, Died))
     assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
     assert client.gone_within(300)
@@ -321,19 +320,3 @@ def test_a_second_answer_ends_the_child(fake_child):
     events = []
     wait_for(client, lambda e: isinstance(e, Died), into=events)
     assert [type(event) for event in events] == [Response, Died]
-
-
-@pytest.mark.parametrize(
-    ("line", "fault"),
-    [
-        ('\'{"id": 1, "result": {"version"\'', "not JSON"),
-        ("'{' * 1000", "not JSON"),
-        ("'{\"id\": 1, \"result\": \"' + 'x' * 5_000_000 + '\"}'", "longer than 4 MB"),
-    ],
-    ids=["cut off", "nested", "long"],
-)
-def test_a_line_that_begins_as_a_message_and_cannot_be_read_ends_the_child(fake_child, line, fault):
-    client = fake_child(f"print({line}, flush=True)\ntime.sleep(60)")
-    died = wait_for(client, lambda e: isinstance(e, Died))
-    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
-    assert client.gone_within(300)

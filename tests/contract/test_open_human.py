@@ -103,6 +103,7 @@ def provenance(text: str) -> Callable[[Tensors, dict[str, str]], object]:
         (provenance('{"seed": "seven"}'), False),
         (provenance('{"unknown": NaN}'), False),
         (provenance(json.dumps("\0")), False),
+        (provenance("[" * 100_000), False),
         (lambda _, metadata: metadata.update(compact="{}"), False),
         (lambda tensors, _: tensors.update(rgb=tensors["rgb"].bfloat16()), True),
         (lambda tensors, _: tensors.update(unknown=torch.full((2,), torch.nan)), True),
@@ -132,20 +133,15 @@ def saved(tmp_path):
     return tmp_path / "a.human"
 
 
-def test_a_file_taken_apart_and_written_again_is_the_same_person(saved, tmp_path):
-    write_tensors(tmp_path / "b.human", read_tensors(saved))
-    again = load_human(tmp_path / "b.human")
-    assert again.payload.density.equal(person().payload.density)
-    assert again.payload.rgb.equal(person().payload.rgb)
-    assert dict(again.provenance) == {"seed": 1}
-
-
 def test_a_reshaped_person_in_a_file_is_the_backends_reshaped_person(saved, tmp_path):
     betas = np.linspace(-1.5, 1.5, 10).astype(np.float32)
     kept = reshaped(read_tensors(saved), betas, default_body().growth(person().betas.numpy(), betas))
     write_tensors(tmp_path / "b.human", kept)
     again, wanted = load_human(tmp_path / "b.human"), reshape_in_backend(person(), torch.tensor(betas))
     assert again.betas.equal(wanted.betas)
+    assert again.payload.rgb.equal(person().payload.rgb)
+    assert again.payload.density.equal(person().payload.density)
+    assert dict(again.provenance)["seed"] == 1
     assert torch.allclose(again.payload.delta_scale, wanted.payload.delta_scale, rtol=1e-5)
     assert wanted.payload.delta_scale.max() > 1.05 * person().payload.delta_scale.max()
 

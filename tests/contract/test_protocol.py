@@ -20,7 +20,7 @@ def own_child():
     child.close()
 
 
-def test_hello_answers_before_torch_is_there_and_ready_names_the_device(own_child):
+def test_hello_comes_before_torch_ready_names_the_device_and_shutdown_ends_the_child(own_child):
     own_child.send(1, "hello")
     hello = own_child.until(lambda m: True)
     assert hello["id"] == 1, "hello comes before ready"
@@ -35,6 +35,8 @@ def test_hello_answers_before_torch_is_there_and_ready_names_the_device(own_chil
     assert ready["problem"] is None
     assert ready["device"] in ("cpu", "cuda")
     assert own_child.ask(2, "hello")["result"]["device"] == ready["device"]
+    assert own_child.ask(3, "shutdown")["result"] == {}
+    assert own_child.process.wait(300) == 0
 
 
 def test_heartbeats_come_while_the_child_is_idle(child):
@@ -194,41 +196,6 @@ def test_the_child_ends_when_its_output_is_not_read(tmp_path):
     process.stderr.close()
 
 
-def test_shutdown_is_answered_and_ends_the_child(own_child):
-    assert own_child.ask(1, "shutdown")["result"] == {}
-    assert own_child.process.wait(300) == 0
-
-
-NOISY = """
-import os, threading, time
-import primdiffusion.serve as serve
-
-def babble():
-    while True:
-        print("stray print")
-        os.write(1, b"stray write\\n")
-        time.sleep(0.002)
-
-guard = serve.guard_streams
-def guard_then_babble():
-    streams = guard()
-    threading.Thread(target=babble, daemon=True).start()
-    return streams
-serve.guard_streams = guard_then_babble
-serve.main()
-"""
-
-
-def test_stray_prints_and_writes_go_to_stderr_and_never_into_the_conversation(checkpoint, tmp_path):
-    child = Conversation(("-c", NOISY))
-    child.send(1, "generate", seed=1, steps=3, size=32, out_dir=str(tmp_path / "out"), checkpoint=str(checkpoint))
-    assert child.answer(1)["result"]["steps"] == 3
-    child.close()
-    assert child.stray_lines == []
-    assert child.stderr.count(b"stray print") > 10
-    assert child.stderr.count(b"stray write") > 10
-
-
 def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
     breaking = "import sys; sys.modules['torch'] = None; import primdiffusion.serve as serve; serve.main()"
     child = Conversation(("-c", breaking))
@@ -242,22 +209,37 @@ def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
     child.close()
 
 
-FAILING = """
-import torch
-import primdiffusion.human as human, primdiffusion.serve as server
+NOISY_AND_FAILING = """
+import os, threading, time
+import primdiffusion.serve as serve
+
+def babble():
+    while True:
+        print("stray print")
+        os.write(1, b"stray write\\n")
+        time.sleep(0.002)
 
 def fail(model, seeds, *_):
     if seeds == [1]:
         torch.empty(10**15)
     raise KeyError("a defect")
 
+guard = serve.guard_streams
+def guard_then_babble():
+    streams = guard()
+    threading.Thread(target=babble, daemon=True).start()
+    return streams
+serve.guard_streams = guard_then_babble
+
+import torch
+import primdiffusion.human as human
 human.generate_batch = fail
-server.main()
+serve.main()
 """
 
 
-def test_out_of_memory_and_a_defect_fail_their_job_and_not_the_child(checkpoint, tmp_path):
-    child = Conversation(("-c", FAILING))
+def test_out_of_memory_a_defect_and_stray_prints_disturb_neither_the_child_nor_the_conversation(checkpoint, tmp_path):
+    child = Conversation(("-c", NOISY_AND_FAILING))
     params = {"out_dir": str(tmp_path / "out"), "checkpoint": str(checkpoint)}
     memory = child.ask(1, "generate", seed=1, **params)["error"]
     assert (memory["code"], memory["data"]["kind"]) == (DOMAIN_ERROR, "out_of_memory")
@@ -268,5 +250,7 @@ def test_out_of_memory_and_a_defect_fail_their_job_and_not_the_child(checkpoint,
     assert child.ask(3, "hello")["result"]["ready"]
     assert not (tmp_path / "out").exists()
     child.close()
-    assert b"Traceback" in child.stderr
     assert child.process.returncode == 0
+    assert child.stray_lines == []
+    assert all(child.stderr.count(words) > 10 for words in (b"stray print", b"stray write"))
+    assert b"Traceback" in child.stderr

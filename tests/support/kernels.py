@@ -3,6 +3,7 @@
 numba has a cache for each folder of sources, and compiling the marcher takes half a minute.
 """
 
+import contextlib
 import hashlib
 import os
 from pathlib import Path
@@ -18,6 +19,11 @@ def share() -> None:
     """Name the cache in the environment; call before numba is imported."""
     os.environ.setdefault("PRIMDIFFUSION_CACHE", str(CACHE))
     os.environ.setdefault("NUMBA_CACHE_DIR", str(CACHE / "numba"))  # where the extension tells children to cache
+    for folder in {path.parents[1] for path in BACKEND.rglob("__pycache__/*.nbi")}:  # compiled when this was set up
+        own = _cache_of(folder)
+        own.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # it is there, or this system has no links
+            own.symlink_to(folder / "__pycache__")
 
 
 def share_with_installed(user_folder: Path) -> None:

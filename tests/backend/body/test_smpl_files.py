@@ -168,7 +168,7 @@ def test_hostile_pickle_is_rejected_by_name_and_does_not_run(tmp_path, protocol,
     trace = tmp_path / "trace"
     content = {**smpl_arrays(), where: Hostile(pathlib.os.mkdir, str(trace))}
     path = pickled(tmp_path, content, protocol)
-    with pytest.raises(FileError, match=r"(posix|nt)\.mkdir"):
+    with refused(FileError, ".mkdir"):
         load_body(path, uv=path)
     assert not trace.exists()
     pickle.loads(path.read_bytes())  # the same bytes do harm where nobody holds them back

@@ -15,7 +15,7 @@ from primdiffusion.encoder.texture import BESIDE, TEXTURE_SIDE, eroded, sample_b
 from primdiffusion.encoder.unproject import SIDE
 from primdiffusion.geometry.camera import Camera, look_at
 from scipy.ndimage import binary_erosion
-from stage_one_twin import resized
+from torch import Tensor
 
 TOLERANCE = 0.020
 
@@ -95,6 +95,16 @@ def test_a_point_in_front_of_the_surface_is_hidden_as_one_behind(front, seen):
     )
     depth = np.full((1, 8, 8), 2, np.float32)
     assert sample_both_sides(views, depth, torch.tensor([[0.05, 0.05, front]]))[1].tolist() == [seen]
+
+
+def resized(texture: Tensor) -> Tensor:
+    """A texture [3, 512, 512] at 256 x 256: bilinear, corner texels map to corner texels."""
+    at = torch.arange(256).double() * (511 / 255)
+    low = at.long().clamp(max=510)
+    share = at - low
+    x = texture.double()
+    x = x[:, low] * (1 - share)[:, None] + x[:, low + 1] * share[:, None]
+    return x[..., low] * (1 - share) + x[..., low + 1] * share
 
 
 def test_the_texture_is_sampled_at_512_and_resized_with_corners_aligned():

@@ -93,9 +93,9 @@ def test_training_is_deterministic_and_survives_its_file(tmp_path):
     images = dots(8)
     losses = []
     networks = [
-        fit_pose_depth_network(images, epochs=2, batch=8, report=lambda _, loss: losses.append(loss)) for _ in range(2)
+        fit_pose_depth_network(images, epochs=1, batch=8, report=lambda _, loss: losses.append(loss)) for _ in range(2)
     ]
-    assert losses[:2] == losses[2:]
+    assert losses[0] == losses[1]
     first, second = (network.state_dict() for network in networks)
     assert all(torch.equal(first[name], second[name]) for name in first)
     networks[0].card["errors"] = {"pckh": 50.0}
@@ -116,7 +116,7 @@ def test_the_weights_that_ship_are_small_and_as_good_as_their_card_says():
         assets = open_assets()
     except FileNotFoundError as error:
         pytest.skip(str(error))
-    errors = held_out_errors(network, training_images(assets, [3_100_000, 3_100_001], 16), PCK_SHARE)
+    errors = held_out_errors(network, training_images(assets, [3_100_000], 16), PCK_SHARE)
     assert errors["pckh"] > stated["pckh"] - 20
     assert errors["depth"] < 2 * stated["depth"]
 

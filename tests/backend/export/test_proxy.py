@@ -141,13 +141,13 @@ def test_stages_are_reported_and_may_end_the_job():
     def stop(stage, _done, _total):
         raise InterruptedError(stage)
 
-    with pytest.raises(InterruptedError, match="surface"):
+    with refused(InterruptedError, "surface"):
         mesh_proxy(person(), SMALL, stop)
 
 
 @pytest.mark.parametrize("wrong", [{"spacing": 0.0}, {"triangles": 10}, {"texture_px": 9000}])
 def test_impossible_settings_are_rejected(wrong):
-    with pytest.raises(FieldError, match=next(iter(wrong))):
+    with refused(FieldError, *wrong):
         read(ProxySettings, wrong)
 
 

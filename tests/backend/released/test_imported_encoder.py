@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.capture.conditioning import captured_person
@@ -17,10 +18,13 @@ from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import load_encoder, look_up
 from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError
+from primdiffusion.formats.capture_layout import picture_path
+from primdiffusion.geometry.camera import look_at
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.people.stored_people import read_person
 from primdiffusion.primitives.primitives import K, S
+from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.released.imported import Reference, reference_extents
 from primdiffusion.released.stage_one import account_stage_one, encoder_tensors
 from released_files import (
@@ -29,7 +33,6 @@ from released_files import (
     random_network,
     random_stage_one,
     save_body,
-    save_capture,
     save_released,
     state,
     template,
@@ -48,6 +51,39 @@ def line(folder: Path, out: str = "imported.safetensors", *more: str) -> list[st
 @pytest.fixture(scope="module")
 def stage() -> dict[str, torch.Tensor]:
     return random_stage_one(template())
+
+
+def save_capture(root: Path, name: str = "someone", size: int = 48, cameras: int = 4) -> Path:
+    """A dataset of the drum in the released layout, grey by its normals, in two frames; returns its subject."""
+    body, folder = load_body(root / "SMPL_NEUTRAL.pkl", root / "smpl_uv.obj"), root / "captures" / name
+    (folder / "outputs_re_fitting").mkdir(parents=True)
+    (folder.parent / "release_human_list.txt").write_text(f"{name}\n")
+    corners = body.template[body.faces].double().numpy()
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    grey = np.clip(128 + 100 * normals @ [0.6, 0.0, 0.8] / np.linalg.norm(normals, axis=1), 0, 255).astype(np.uint8)
+    rig = {}
+    for number in range(cameras):
+        yaw = 2 * np.pi * number / cameras
+        position = torch.tensor([3 * np.sin(yaw), 0.2, 3 * np.cos(yaw)]).float()
+        camera = look_at(position, torch.zeros(3), vertical_fov=0.8, width=size, height=size)
+        world = camera.world_to_camera.double().numpy()
+        rig[f"camera{number:04d}"] = {
+            "K": camera.intrinsics.double().tolist(), "R": world[:, :3].tolist(), "T": world[:, 3].tolist()
+        }  # fmt: skip
+        found = nearest_triangles(corners, camera).triangle
+        mask = np.where(found >= 0, 255, 0).astype(np.uint8)
+        for kind, pixels in (("img", np.where(found >= 0, grey[found], 0)[..., None].repeat(3, -1)), ("mask", mask)):
+            for frame in range(2):
+                path = picture_path(folder, kind, number, frame)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(pixels.astype(np.uint8)).save(path)
+    (folder / "cameras.json").write_text(json.dumps(rig))
+    parameters = {
+        "global_orient": np.zeros((2, 3)), "body_pose": np.zeros((2, 69)), "betas": np.zeros((1, 10)),
+        "transl": np.zeros((2, 3)),
+    }  # fmt: skip
+    np.savez(folder / "outputs_re_fitting" / "refit_smpl_2nd.npz", smpl=np.array(parameters, dtype=object))
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from march_scenes import sheet_frames
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
-from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cpu.march import march_cpu
 from primdiffusion.render.descent import LARGEST_CHANGE, DescentSettings, descend, render_view
 from primdiffusion.render.image import PosedView
@@ -28,6 +27,16 @@ from support.errors import refused
 FULL = 200.0
 SIDE = 3
 """Boxes along a side of the sheet that is fitted."""
+
+
+def sheet_frames(side: int) -> Frames:
+    """side x side overlapping boxes in a plane, all facing +z."""
+    line = (torch.arange(side) - (side - 1) / 2) * 0.05
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    position = torch.stack([x.flatten(), y.flatten(), torch.zeros(side**2)], dim=-1)
+    return Frames(position, torch.eye(3).expand(side**2, 3, 3).clone(), torch.full((side**2, 3), 0.045))
+
+
 FRAMES = sheet_frames(SIDE)
 
 

@@ -28,16 +28,27 @@ def test_each_option_reaches_its_setting(tmp_path):
     )  # fmt: skip
 
 
-def test_a_camera_file_with_a_reflection_is_refused_and_its_camera_named(tmp_path):
+@pytest.mark.parametrize("words", ["--rm -rf", "--seed=-1", f"--seed={2**63}"])
+def test_what_no_option_can_be_is_named(tmp_path, words):
+    with refused(ValueError, words.split("=")[-1].split()[0]):
+        settings_of(parse(["--out", str(tmp_path), *words.split()]))
+
+
+EYE, REFLECTION, STRETCHED = (np.diag([x, 1.0, 1.0]).tolist() for x in (1, -1, 2))
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        [],
+        {},
+        "no cameras",
+        {"camera0000": {"K": 1}},
+        *({"camera0000": {"K": EYE, "R": r, "T": [0, 0, 3]}} for r in (REFLECTION, STRETCHED)),
+    ],
+)
+def test_a_file_whose_cameras_are_none_is_refused_and_the_camera_named(tmp_path, cameras):
     path = tmp_path / "cameras.json"
-    cameras = {f"camera000{i}": {"K": np.eye(3).tolist(), "R": np.eye(3).tolist(), "T": [0, 0, 3]} for i in range(2)}
-    cameras["camera0001"]["R"] = np.diag([-1.0, 1, 1]).tolist()
     path.write_text(json.dumps(cameras))
-    with refused(FileError, str(path), "camera0001", "rotation"):
+    with refused(FileError, str(path), *(["camera0000"] if isinstance(cameras, dict) and cameras else [])):
         settings_of(parse(["--out", str(tmp_path), "--camera-file", str(path)]))
-
-
-@pytest.mark.parametrize("seed", ["-1", str(2**63)])
-def test_a_seed_out_of_range_is_named(tmp_path, seed):
-    with refused(ValueError, str(seed)):
-        settings_of(parse(["--out", str(tmp_path), f"--seed={seed}"]))

@@ -60,14 +60,6 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
     assert seeds() == [11, 13]
 
 
-def test_a_job_that_is_not_queued_cannot_be_cancelled(addon):
-    number = ask(11)
-    with refused(RuntimeError, "running"):
-        ops.cancel()
-    with refused(RuntimeError, "queued"):
-        ops.cancel(number=number + 1)
-
-
 def test_cancelling_the_running_job_starts_the_next(addon):
     ask(TAKES_LONG, 50)
     ask(12)
@@ -248,3 +240,18 @@ def test_the_log_holds_versions_and_the_error(addon):
     for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
         assert part in text
     assert str(Path.home()) not in text
+
+
+def test_the_panel_jobs_is_shown_only_while_there_are_any_and_cancel_says_what_is_not_running(addon):
+    shows = PRIMDIFFUSION_PT_jobs.poll
+    assert not shows(addon)
+    with refused(RuntimeError, "running"):
+        ops.cancel()
+    number = ask(11)
+    assert shows(addon)
+    refusals = {"number": (number + 1, "queued"), "what": ("CAPTURES", "no captures")}
+    for name, (value, named) in refusals.items():
+        with refused(RuntimeError, named):
+            ops.cancel(**{name: value})
+    drive()
+    assert not shows(addon)

@@ -1,26 +1,16 @@
 """Timers change data at safe moments alone, and never outside an undo step."""
 
-import time
 from types import SimpleNamespace
 
 import bpy
 import pytest
-from jobs_driven import drive, error_of
+from jobs_driven import drive, error_of, until_ready
 
 from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
-
-
-def until_ready() -> None:
-    """Until the child's result is there, and built but for the step into the scene."""
-    end = time.monotonic() + 300
-    while not queue.ready:
-        assert time.monotonic() < end
-        queue.tick()
-        time.sleep(0.01)
 
 
 def steps(*names: str) -> None:

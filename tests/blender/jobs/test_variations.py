@@ -1,10 +1,13 @@
 """The contact sheet: people of many seeds, seen before anything is built, and exactly those that are then built."""
 
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
+import numpy as np
 import pytest
+from blender_primdiffusion.files.picture_files import write_png
 from blender_primdiffusion.formats.answers import VariationFiles
 from human_files import person_file
 from jobs_driven import Layout, drive, error_of, shown, until_running
@@ -13,7 +16,7 @@ from support.fake_child import FAILS, TAKES_LONG, request_of
 
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
-from blender_primdiffusion.jobs.windows import icons
+from blender_primdiffusion.jobs.windows import Icons, icons
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import variations_panel
 
@@ -234,3 +237,22 @@ def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     with refused(OSError, "picture"):
         own.fill([person], "")
     assert mine.read_text() == "mine"
+
+
+def painted(path: Path, green: int) -> Path:
+    write_png(path, np.full((8, 8, 3), (0, green, 0), np.uint8))
+    os.utime(path, ns=((green + 1) * 10**9,) * 2)
+    return path
+
+
+def test_a_picture_that_is_written_again_is_read_again_and_one_that_is_gone_is_let_go(tmp_path):
+    own, path = Icons(), tmp_path / "a.png"
+    for green in (0, 99):
+        own.of(painted(path, green))
+        assert own._previews[str(path)].image_pixels_float[1] == pytest.approx(green / 255, abs=0.01)
+    path.unlink()
+    assert own.of(path) == own.of(None) == 0
+    own.of(painted(tmp_path / "b.png", 9))
+    assert list(own._previews) == [str(tmp_path / "b.png")]
+    own.free()
+    own.free()

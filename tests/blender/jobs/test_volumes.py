@@ -1,10 +1,13 @@
 """Volumes are written when they are to be seen: by a job for views, before renders by another engine."""
 
 import bpy
+import numpy as np
 import pytest
 import synthetic_shape
-from human_files import copy_of, folder_of, forget_session_files
+from human_files import copy_of, folder_of, forget_session_files, volume_path
 from jobs_driven import error_of, notice_of
+from oracle import evaluated_matrices
+from support.errors import refused
 
 import blender_primdiffusion
 from benchmarks.cycles_preview import setup_cycles_preview
@@ -12,9 +15,11 @@ from blender_primdiffusion.engine.engine import ENGINE
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.volumes import VolumesJob, faults, write_before_rendering
 from blender_primdiffusion.scene import volumes
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import HumanTarget, humans
-from blender_primdiffusion.scene.representation import in_viewport
+from blender_primdiffusion.scene.merged import merged_of
+from blender_primdiffusion.scene.representation import in_viewport, representation_of, set_representation
 from blender_primdiffusion.scene.volume_nodes import are_written, volumes_of
 
 ops = bpy.ops.primdiffusion
@@ -72,7 +77,7 @@ def test_a_cancelled_job_keeps_what_is_written_and_shows_nothing(person, monkeyp
 
 @pytest.mark.any_blender
 def test_a_full_disk_is_told_and_nothing_is_shown(person, full_disk):
-    with pytest.raises(RuntimeError, match="No space left"):
+    with refused(RuntimeError, "No space left"):
         ops.volumes_in_viewport()
     assert "No space left" in error_of("volumes")
     assert not in_viewport(person)
@@ -112,29 +117,11 @@ def test_the_first_picture_by_cycles_shows_the_human(person, tmp_path):
     assert max(list(picture.pixels)[3::4]) > 0.2
 
 
-@pytest.mark.parametrize("link", [False, True])
-def test_appended_or_linked_a_render_has_them(person, tmp_path, link):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=link) as (_, wanted):
-        wanted.collections = ["Human"]
-    bpy.context.scene.collection.children.link(bpy.data.collections["Human"])
-    write_before_rendering(bpy.context.scene)
-    (human,) = humans(bpy.context.scene)
-    assert are_written(human)
-    volumes_of(human).hide_viewport = False
-    assert drawn() == COUNT
-
-
-def test_a_copy_renders_what_is_written_for_both(person):
-    twin = copy_of(person)
-    write_before_rendering(bpy.context.scene)
-    assert are_written(twin)
-    assert folder_of(twin) == folder_of(person)
-
-
 @pytest.mark.any_blender
-def test_what_a_render_cannot_write_is_told_once(person, full_disk, capsys):
+def test_what_a_render_cannot_write_is_told_and_forgotten_when_it_is_written_or_the_extension_disabled(
+    person, full_disk
+):
+    twin = copy_of(person)
     for _ in range(2):
         write_before_rendering(bpy.context.scene)
     assert "No space left" in faults.text
@@ -142,18 +129,14 @@ def test_what_a_render_cannot_write_is_told_once(person, full_disk, capsys):
     write_before_rendering(bpy.context.scene)
     assert faults.text == ""
     assert are_written(person)
-
-
-@pytest.mark.any_blender
-def test_what_was_wrong_is_forgotten_when_the_extension_is_disabled(person):
+    assert are_written(twin)
+    assert folder_of(twin) == folder_of(person), "once for both"
     faults.report("the human 'Anna' cannot be drawn")
     blender_primdiffusion.unregister()
     assert faults.text == ""
 
 
 def test_cycles_merges_humans_that_stand_still_and_leaves_those_that_move(person):
-    from blender_primdiffusion.scene.representation import representation_of
-
     moving = copy_of(person)
     moving.animation_data_create().action = bpy.data.actions.new("Walk")
     assert ops.set_up_engine(engine="CYCLES") == {"FINISHED"}
@@ -195,3 +178,31 @@ def test_volumes_that_renders_hide_are_not_written_and_those_of_other_scenes_are
     bpy.ops.scene.new(type="EMPTY")
     write_before_rendering(bpy.context.scene)  # it may hold an instance of the human
     assert are_written(person)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_merged_by_the_real_child_a_human_fills_the_space_of_the_volumes_on_the_surface(real_child):
+    real_child.scene.primdiffusion.steps = 2
+    ops.generate(seed=1)
+    (person,) = humans(real_child.scene)
+    turns = np.tile(np.eye(3), (24, 1, 1))
+    turns[16] = [[np.cos(1.2), np.sin(1.2), 0], [-np.sin(1.2), np.cos(1.2), 0], [0, 0, 1]]
+    pose_from_joint_rotations(person, turns)
+    bpy.context.scene.primdiffusion_merging.voxel = 0.0005
+    with refused(RuntimeError, "choose", "mm or more"):
+        ops.merge()
+    bpy.context.scene.primdiffusion_merging.voxel = 0.02
+    assert ops.merge() == {"FINISHED"}
+    bpy.utils.expose_bundled_modules()
+    import openvdb
+
+    grid = openvdb.read(str(volume_path(merged_of(person).data)), "density")
+    box = np.array([grid.transform.indexToWorld(corner) for corner in grid.evalActiveVoxelBoundingBox()])
+    set_representation(person, "VOLUMES")
+    places_of = evaluated_matrices(person)[:, :3, 3] - np.array(person.matrix_world)[:3, 3]
+    assert len(places_of) == 1024
+    centres = np.array([np.min(places_of, 0), np.max(places_of, 0)])
+    assert (box[0] < centres[0] + 0.02).all()
+    assert (box[1] > centres[1] - 0.02).all()
+    np.testing.assert_allclose(box, centres, atol=0.15)

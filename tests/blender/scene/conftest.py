@@ -15,6 +15,12 @@ def source(addon, tmp_path, monkeypatch):
 
 
 @pytest.fixture
+def content(source):
+    """The bytes of the human's file, and of its body's."""
+    return tuple((source / name).read_bytes() for name in ("person.human.safetensors", "body.safetensors"))
+
+
+@pytest.fixture
 def person(source):
     anna = build_posed(source)
     bpy.ops.wm.save_mainfile()

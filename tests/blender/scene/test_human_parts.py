@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from human_files import copy_of, paths_of, press_x
+from human_files import copy_of, held, paths_of, press_x
 from human_stage import build_posed, named, places, whole
 
 from blender_primdiffusion.jobs import parts as module
 from blender_primdiffusion.jobs.parts import complete_humans, orphans, without_parts
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import PROXY_MARK, body_of, humans, parts_of
+from blender_primdiffusion.scene.human import PAYLOAD, PROXY_MARK, body_of, humans, parts_of
 from blender_primdiffusion.scene.shape import betas_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
@@ -69,7 +69,7 @@ def test_undo_leads_back_over_the_removal_of_the_parts(person):
 
 
 @pytest.mark.parametrize("linked", [False, True], ids=["Shift-D", "Alt-D"])
-def test_a_copy_of_the_armature_gets_parts_of_its_own(person, linked):
+def test_a_copy_of_the_armature_gets_parts_of_its_own_and_shares_the_file_until_an_edit(person, content, linked):
     where = places(person)
     person.select_set(True)
     bpy.context.view_layer.objects.active = person
@@ -84,6 +84,9 @@ def test_a_copy_of_the_armature_gets_parts_of_its_own(person, linked):
     twin.location.x += 1.0
     assert whole(named(), where)
     assert paths_of(twin) == paths_of(person)
+    assert twin[PAYLOAD] == person[PAYLOAD]
+    ops.vary(human="Anna", seed=12)
+    assert twin[PAYLOAD].packed_file.data == content[0] != held(named())[0]
 
 
 def test_a_copy_has_the_shape_and_a_later_one_is_its_own(person):
@@ -105,15 +108,6 @@ def test_an_armature_appended_alone_becomes_whole(person, tmp_path):
     bpy.context.scene.collection.objects.link(wanted.objects[0])
     module.complete()
     assert whole(named(), where)
-
-
-def test_linked_humans_and_overrides_stay_as_they_are(person, tmp_path):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
-        wanted.objects = ["Anna"]
-    bpy.context.scene.collection.objects.link(wanted.objects[0])
-    assert not complete_humans()
 
 
 def test_a_copy_whose_data_are_damaged_is_told_and_left(person, capsys):

@@ -6,8 +6,7 @@ import os
 import shutil
 
 import bpy
-import pytest
-from human_files import folder_of, forget_session_files, lose_data, person_file
+from human_files import folder_of, forget_session_files, held, lose_data, person_file
 from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
@@ -17,25 +16,11 @@ from blender_primdiffusion.scene.human import (
     BODY_MARK,
     PAYLOAD,
     body_of,
-    humans,
-    is_human,
-    session_file,
     session_folder,
 )
 
 ops = bpy.ops.primdiffusion
 ODD = 'Ä ö\' "x" 100%s 年'
-
-
-@pytest.fixture
-def content(source):
-    """The bytes of the human's file, and of its body's."""
-    return tuple((source / name).read_bytes() for name in ("person.human.safetensors", "body.safetensors"))
-
-
-def held(person) -> tuple[bytes, bytes]:
-    armature = person
-    return tuple(armature[name].packed_file.data for name in (PAYLOAD, BODY))
 
 
 def reopened(path=None) -> bpy.types.Object:
@@ -44,15 +29,6 @@ def reopened(path=None) -> bpy.types.Object:
     forget_session_files()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return named()
-
-
-def test_saved_and_opened_again(person, content):
-    where = places(person)
-    assert held(person) == content
-    anna = reopened()
-    assert held(anna) == content
-    assert whole(anna, where)
-    assert person_file(anna).read_bytes() == content[0]
 
 
 def test_saved_under_another_name_elsewhere_and_then_moved(person, content, tmp_path):
@@ -68,7 +44,9 @@ def test_saved_under_another_name_elsewhere_and_then_moved(person, content, tmp_
 
 def test_a_file_never_saved_and_then_saved(source, content, tmp_path):
     bpy.ops.wm.read_homefile(use_empty=True)
-    where = places(build_posed(source))
+    anna = build_posed(source)
+    assert build_posed(source, "Berta")[BODY] == anna[BODY], "humans of one body hold it once"
+    where = places(anna)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "new.blend"))
     assert whole(reopened(), where)
     assert held(named()) == content
@@ -96,59 +74,6 @@ def test_an_edit_packs_another_file_and_undo_and_redo_switch_it(person, content)
     bpy.ops.wm.save_mainfile()
     assert held(reopened()) == edited
     assert len([image for image in bpy.data.images if image.packed_file]) == 2, "the file before is not saved"
-
-
-@pytest.mark.parametrize("link", [False, True])
-def test_appended_and_linked(person, content, tmp_path, link):
-    where = places(person)
-    bpy.ops.wm.read_homefile(use_empty=True)
-    forget_session_files()
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=link) as (_, wanted):
-        wanted.collections = ["Anna"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    assert held(named()) == content
-    assert whole(named(), where)
-
-
-def test_a_library_override(person, content, tmp_path):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
-        wanted.collections = ["Anna"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    made = wanted.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
-    override = next(filter(is_human, made.all_objects))
-    assert held(override) == content
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
-    reopened(tmp_path / "film.blend")
-    assert held(next(one for one in humans(bpy.context.scene) if one.library is None)) == content
-
-
-@pytest.mark.parametrize("linked", [False, True], ids=["Shift-D", "Alt-D"])
-def test_blenders_duplicate_of_the_armature_shares_the_file_until_an_edit(person, content, linked):
-    person.select_set(True)
-    bpy.ops.object.duplicate(linked=linked)
-    twin = bpy.context.view_layer.objects.active
-    assert twin[PAYLOAD] == person[PAYLOAD]
-    assert session_file(twin) == person_file(person)
-    ops.vary(human="Anna", seed=12)
-    assert held(named())[0] != content[0]
-    assert twin[PAYLOAD].packed_file.data == content[0]
-
-
-def test_two_humans_of_the_same_body_hold_it_once(person, source):
-    berta = build_posed(source, "Berta")
-    assert berta[BODY] == person[BODY]
-
-
-def test_x_on_the_armature_and_undo(person, content):
-    bpy.ops.ed.undo_push(message="before")
-    person.select_set(True)
-    bpy.ops.object.delete()
-    bpy.ops.ed.undo_push(message="deleted")
-    assert not [obj for obj in bpy.data.objects if obj.type == "ARMATURE"]
-    bpy.ops.ed.undo()
-    assert held(named()) == content
-    assert whole(named())
 
 
 def test_unpacked_by_blender_the_file_is_the_same(person, content, tmp_path):

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from human_files import paths_of, person_file, remove_human
-from jobs_driven import drive, error_of, notice_of, shown, until_running
+from human_files import paths_of, person_file
+from jobs_driven import drive, notice_of, shown, until_running
 from support.errors import refused
-from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
+from support.fake_child import TAKES_LONG, request_of
 from support.tensor_files import read_tensors
 
 from blender_primdiffusion.jobs.generate import EditJob
 from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.edit import painted_weights
 from blender_primdiffusion.scene.human import body_of, humans, parts_of
 from blender_primdiffusion.ui import edit_panel
 
@@ -32,10 +32,9 @@ pytestmark = pytest.mark.any_blender
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
     """Somebody at work on whom there is to edit, and somebody else, in a saved file."""
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
-    for _ in range(2):
-        ops.generate(seed=7)
-    first, _ = humans(addon.scene)
+    file = synthetic_shape.write(tmp_path / "prepared", COUNT)
+    monkeypatch.setenv("FAKE_HUMAN", str(file))
+    first, _ = build_human(addon, file), build_human(addon, file)
     addon.view_layer.objects.active = first
     bpy.ops.ed.undo_push(message="two people")
     return first
@@ -112,7 +111,10 @@ def test_a_script_sets_what_the_panel_shows(person):
 def test_a_blend_moves_the_body_where_the_betas_differ(person):
     betas = read_tensors(person_file(person))[0]["betas"].astype(np.float64)
     settings().other, settings().fraction = humans(bpy.context.scene)[1], 0.75
-    assert ops.blend() == {"FINISHED"}
+    for obj in list(parts_of(person)):
+        obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
+        obj.hide_select = obj.hide_viewport = True
+    assert ops.blend(human="Human") == {"FINISHED"}, "locked and hidden, too"
     asked = sent(person)
     assert (asked["other"], asked["fraction"]) == (str(person_file(humans(bpy.context.scene)[1])), 0.75)
     heads = np.array([person.data.bones[name].head_local for name in synthetic.NAMES])
@@ -130,17 +132,17 @@ def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
     assert sent(other)["seed"] == FINE
     ops.vary(human="Human", seed=FINE + 1)
     assert sent(person)["seed"] == FINE + 1
-
-
-def test_an_edit_of_an_edit_starts_from_the_edited_person(person):
-    ops.vary(seed=FINE)
     edited = person_file(person)
-    ops.vary(seed=FINE + 1)
-    assert sent(person)["person"] == str(edited)
+    ops.vary(human="Human", seed=FINE)
+    assert sent(person)["person"] == str(edited), "an edit of an edit starts from the edited person"
 
 
 def test_a_painted_region_travels_as_weights_of_all_vertices(person):
     body = body_of(person)
+    settings().region, settings().vertex_group = "PAINTED", "sleeve"
+    with refused(RuntimeError, "sleeve"):
+        ops.redress(seed=FINE)
+    settings().property_unset("vertex_group")
     assert ops.paint_region() == {"FINISHED"}
     assert (body.mode, bpy.context.object, body.hide_viewport) == ("WEIGHT_PAINT", body, False)
     assert settings().region == "PAINTED"
@@ -159,105 +161,7 @@ def test_a_painted_region_travels_as_weights_of_all_vertices(person):
         ops.paint_region(finish=True)
 
 
-def test_a_vertex_group_that_is_not_there_is_named(person):
-    settings().region, settings().vertex_group = "PAINTED", "sleeve"
-    with refused(RuntimeError, "sleeve"):
-        ops.redress(seed=FINE)
-    with refused(ValueError, "sleeve"):
-        painted_weights(body_of(person), "sleeve")
-
-
-@pytest.mark.parametrize(
-    ("seed", "sentence"),
-    [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "contains no human")],
-)
-def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, seed, sentence):
-    before, file, files = paths_of(person), person_file(person), sorted(person_file(person).parent.iterdir())
-    with pytest.raises(RuntimeError, match=sentence) as caught:
-        ops.vary(seed=seed)
-    assert str(caught.value).count("Error:") == 1
-    assert (paths_of(person), person_file(person)) == (before, file)
-    assert sorted(file.parent.iterdir()) == files
-    assert not list(Path(bpy.app.tempdir).glob("vary_*"))
-    assert sentence in drawn("VARY").replace(" | ", " ")  # lines are wrapped
-    assert sentence not in drawn("REDRESS")
-
-
-@pytest.mark.parametrize("by_hand", [False, True], ids=["human removed", "objects deleted by hand"])
-def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person, by_hand):
-    _, other = humans(bpy.context.scene)
-    before = paths_of(other)
-    start(person)
-    until_running()
-    if by_hand:
-        bpy.data.batch_remove(list(parts_of(person)))
-    else:
-        remove_human(person)
-    drive()
-    assert "'Human' was removed during the edit" in error_of("vary")
-    assert paths_of(other) == before
-    assert not queue.busy
-
-
-def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
-    cube = bpy.data.objects.new("cube", None)
-    bpy.context.scene.collection.objects.link(cube)
-    bpy.ops.ed.undo_push(message="cube")
-    before = paths_of(person)
-    start(person)
-    until_running()
-    bpy.ops.ed.undo()
-    drive()
-    assert error_of("vary") == ""
-    assert not set(paths_of(humans(bpy.context.scene)[0])) & set(before)
-
-
-def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(addon, tmp_path):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    ops.generate(seed=7)
-    (person,) = humans(bpy.context.scene)
-    start(person)
-    until_running()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
-    person.name = "Anna"
-    drive()
-    assert error_of("vary") == ""
-    assert sent(person)["seed"] == FINE
-
-
-@pytest.mark.parametrize("part", ["armature", "body", "cube"])
-def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, part):
-    cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
-    bpy.context.scene.collection.objects.link(cube)
-    body_of(person).hide_viewport = False
-    obj = {"armature": person, "body": body_of(person), "cube": cube}[part]
-    bpy.context.view_layer.objects.active = obj
-    bpy.ops.ed.undo_push(message="before")
-    before = paths_of(person)
-    start(person)
-    bpy.ops.object.mode_set(mode="EDIT")
-    drive()
-    assert error_of("vary") == ""
-    assert bpy.context.mode == "OBJECT"
-    assert not set(paths_of(person)) & set(before)
-    bpy.ops.ed.undo()
-    assert paths_of(humans(bpy.context.scene)[0]) == before
-
-
-def test_locked_hidden_people_are_edited(person):
-    for obj in list(parts_of(person)):
-        obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
-        obj.hide_select = obj.hide_viewport = True
-    before = paths_of(person)
-    settings().other = humans(bpy.context.scene)[1]
-    assert ops.blend(human="Human") == {"FINISHED"}
-    assert not set(paths_of(person)) & set(before)
-
-
-def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tmp_path):
-    assert not ops.vary.poll()
-    for _ in range(2):
-        ops.generate(seed=7)
+def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(person, addon):
     addon.view_layer.objects.active = None
     settings().parts = set()
     rejected = {
@@ -273,6 +177,8 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
     settings().other = humans(addon.scene)[0]
     with refused(RuntimeError, "'Human' cannot be the other human too"):
         ops.blend(human="Human")
+    bpy.data.batch_remove(list(bpy.data.objects))
+    assert not ops.vary.poll()
 
 
 def test_each_edit_shows_only_its_own_job_and_cancels_it(person):

@@ -6,10 +6,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from blender_primdiffusion.formats.joints import JOINT_NAMES
 from human_files import person_file
 
-from blender_primdiffusion.scene.human import MARK, body_of, humans
+from blender_primdiffusion.scene.human import MARK, humans
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion
@@ -65,24 +64,6 @@ def test_redressing_leaves_everything_outside_the_region_as_it_is(people):
     outside = sorted(set(range(len(before))) - inside)
     assert all(np.array_equal(first[name][outside], second[name][outside]) for name in ("rgb", "density"))
     assert np.array_equal(first["betas"], second["betas"])
-
-
-def test_a_painted_head_is_all_that_changes(people):
-    anna, _ = people
-    body = body_of(anna)
-    before = voxels(anna)
-    head = body.vertex_groups[JOINT_NAMES.index("head")]
-    bpy.context.view_layer.objects.active = anna
-    ops.paint_region()
-    painted = body.vertex_groups["PrimDiffusion Region"]
-    for vertex in body.data.vertices:
-        if any(element.group == head.index and element.weight > 0.5 for element in vertex.groups):
-            painted.add([vertex.index], 1.0, "REPLACE")
-    assert ops.redress(seed=5) == {"FINISHED"}
-    differ = changed(before, voxels(anna))
-    assert differ
-    assert differ <= region("head")
-    ops.paint_region(finish=True)
 
 
 def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_them(people):

@@ -1,12 +1,10 @@
 """The panel Generate: seeds, counts, quality, and people who stand side by side."""
 
-import itertools
 import random
 import re
 from types import SimpleNamespace
 
 import bpy
-import numpy as np
 import pytest
 from human_files import person_file
 from jobs_driven import Layout, drive, shown
@@ -16,7 +14,6 @@ from support.fake_child import FAILS, request_of
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.place import GAP_M, posed_extent
 from blender_primdiffusion.ui import generate_panel
 
 pytestmark = pytest.mark.any_blender
@@ -47,19 +44,12 @@ def test_an_unlocked_seed_is_another_one_after_each_result_and_a_locked_one_stay
     panel_settings.keep_seed, panel_settings.seed = True, 12
     bpy.ops.primdiffusion.generate()
     assert panel_settings.seed == 12
-
-
-def test_a_failure_keeps_the_seed_for_another_try(panel_settings):
-    panel_settings.seed = FAILS
-    with pytest.raises(RuntimeError):
+    panel_settings.keep_seed, panel_settings.seed, panel_settings.count = False, FAILS, 3
+    with refused(RuntimeError):
         bpy.ops.primdiffusion.generate()
-    assert panel_settings.seed == FAILS
-
-
-def test_a_seed_from_a_script_leaves_the_panels_and_is_one_person(addon, panel_settings):
-    panel_settings.count = 3
+    assert panel_settings.seed == FAILS, "for another try"
     bpy.ops.primdiffusion.generate(seed=31)
-    assert (seeds(addon), panel_settings.seed) == ([31], 10)
+    assert (seeds(addon), panel_settings.seed) == ([11, 12, 31], FAILS), "one of a script leaves the panel's"
 
 
 def test_pressing_twice_generates_two_different_humans(addon, panel_settings, queued_jobs):
@@ -78,18 +68,6 @@ def test_a_count_queues_as_many_jobs_with_consecutive_seeds(addon, panel_setting
     drive()
     assert seeds(addon) == [10, 11, 12]
     assert panel_settings.seed not in (10, 11, 12)
-
-
-def test_people_stand_side_by_side_and_the_first_at_the_origin(addon):
-    addon.scene.primdiffusion.count = 3
-    bpy.ops.primdiffusion.generate()
-    extents = sorted((posed_extent(person) for person in humans(addon.scene)), key=lambda extent: extent[0][0])
-    for (_, left), (right, _) in itertools.pairwise(extents):
-        assert right[0] - left[0] >= GAP_M - 1e-6
-    x = [person.location.x for person in humans(addon.scene)]
-    assert x[0] == 0.0
-    assert np.isclose(x[1], -x[2]), "to both sides in turn"
-    assert x[1] > 0
 
 
 def test_a_new_person_takes_the_free_place_in_the_middle(addon):
@@ -157,10 +135,5 @@ def test_after_success_the_panel_has_one_line_and_the_button_of_the_next_step(ad
     line, next_step = (text for text in shown(panel, addon) if text not in before)
     assert re.fullmatch(r"Generated in [0-9.]+ s\.", line)
     assert next_step == button
-
-
-def test_the_next_step_waits_until_no_job_is_running(addon):
-    bpy.ops.primdiffusion.generate(seed=7)
     queue.add(addon, GenerateJob(4, {"steps": 5}))
-    texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
-    assert "primdiffusion.set_up_engine" not in texts
+    assert "primdiffusion.set_up_engine" not in shown(panel, addon), "while a job is running"

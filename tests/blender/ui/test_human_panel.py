@@ -17,7 +17,6 @@ from support.errors import refused
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import CONTROLS
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.handles import has_handles
 from blender_primdiffusion.scene.human import BETAS, MARK, body_of, humans
 from blender_primdiffusion.scene.human_file import shape_model_of
@@ -120,23 +119,16 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_reset_brings_back_the_shape_the_person_was_generated_with(person):
+def test_random_shapes_are_those_of_their_seeds_and_reset_brings_back_the_generated_one(person, addon):
     before = surface(person)
-    reshape(person, np.array(TALL))
-    assert ops.reshape(to="GENERATED") == {"FINISHED"}
-    np.testing.assert_allclose(surface(person), before, atol=1e-5)
-
-
-def test_a_random_shape_is_the_same_for_the_same_seed(person):
     ops.reshape(to="RANDOM", seed=5)
     first = betas_of(person)
     ops.reshape(to="RANDOM", seed=6)
     assert np.abs(betas_of(person) - first).max() > 0.1
     ops.reshape(to="RANDOM", seed=5)
     np.testing.assert_array_equal(betas_of(person), first)
-
-
-def test_each_press_of_random_is_another_body(person, addon):
+    assert ops.reshape(to="GENERATED") == {"FINISHED"}
+    np.testing.assert_allclose(surface(person), before, atol=1e-5)
     pressed = [
         SimpleNamespace(to="RANDOM", seed=0, given=lambda _: False, execute=lambda _: {"FINISHED"}) for _ in range(2)
     ]
@@ -160,11 +152,8 @@ def test_the_panel_shows_provenance(person, addon):
         assert text in details
 
 
-def test_other_bodies_have_sliders_with_numbers(person):
-    assert slider_names(shape_model_of(person)) == [str(number) for number in range(1, 11)]
-
-
 def test_the_six_sliders_with_names_are_shown_and_the_others_folded(person, addon, monkeypatch):
+    assert slider_names(shape_model_of(person)) == [str(number) for number in range(1, 11)], "of another body"
     monkeypatch.setattr(shape, "DEFAULT_BODY_VERTICES", len(shape_model_of(person).template))
     drawn: list[tuple[str, str]] = []
 
@@ -217,24 +206,19 @@ def test_the_panel_offers_to_add_handles_or_else_to_bake_them(addon, armature):
     drawn = set(shown(human_panel.draw_pose, addon))
     assert "primdiffusion.add_handles" in drawn
     assert "primdiffusion.bake_handles" not in drawn
+    ops.add_motion(motion="WAVE", rounds=1)
+    action = armature.animation_data.action
     assert ops.add_handles() == {"FINISHED"}
+    with refused(RuntimeError, "has IK handles"):
+        ops.add_motion(motion="WALK")
+    assert armature.animation_data.action == action
     drawn = set(shown(human_panel.draw_pose, addon))
     assert "primdiffusion.bake_handles" in drawn
     assert "primdiffusion.add_handles" not in drawn
     assert ops.bake_handles() == {"FINISHED"}
     assert not has_handles(armature)
-    with pytest.raises(RuntimeError, match="no IK handles"):
+    with refused(RuntimeError, "no IK handles"):
         ops.bake_handles()
-
-
-def test_motions_wait_until_handles_are_baked(armature):
-    ops.add_motion(motion="WAVE", rounds=1)
-    ops.add_handles()
-    action = armature.animation_data.action
-    with pytest.raises(RuntimeError, match="has IK handles"):
-        ops.add_motion(motion="WALK")
-    assert armature.animation_data.action == action
-    ops.bake_handles()
     assert ops.add_motion(motion="WALK") == {"FINISHED"}
 
 

@@ -7,6 +7,7 @@ import synthetic
 from amass_files import feet, write_amass
 from blender_primdiffusion.formats.poses.files import read_motion
 from jobs_driven import Layout
+from support.errors import refused
 
 from blender_primdiffusion.motion.poses import current_pose
 from blender_primdiffusion.scene.actions import action_curves
@@ -83,7 +84,7 @@ def test_export_counts_constraints_and_rejects_an_empty_range(addon, armature, t
     ops.export_motion(filepath=str(tmp_path / "m.npz"), first=1, last=1)
     turn = read_motion(tmp_path / "m.npz").axis_angle()[0]
     assert np.abs(turn).max() < 1e-4
-    with pytest.raises(RuntimeError, match="last frame 2 is before the first, 5"):
+    with refused(RuntimeError, "frame 2", "5"):
         ops.export_motion(filepath=str(tmp_path / "m.npz"), first=5, last=2)
 
 

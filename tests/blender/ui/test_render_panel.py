@@ -150,18 +150,6 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
 
 
 @pytest.mark.any_blender
-@pytest.mark.parametrize(("order", "message"), [("gives garbage", "damaged"), ("dies", "ended")])
-@pytest.mark.parametrize("what", ["POSE", "FRAMES"])
-def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, what):
-    monkeypatch.setenv("FAKE_ORDER", order)
-    before = sorted(folder_of(person).iterdir())
-    with pytest.raises(RuntimeError, match=message):
-        ops.merge(what=what)
-    assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
-    assert sorted(folder_of(person).iterdir()) == before
-
-
-@pytest.mark.any_blender
 def test_a_human_removed_meanwhile_is_not_merged(person):
     queue.add(bpy.context, MergeJob(HumanTarget.of(person), [PoseSnapshot.capture(person)], 0.02))
     remove_human(person)

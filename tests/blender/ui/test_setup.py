@@ -71,7 +71,7 @@ def draw_preferences() -> Layout:
     return layout
 
 
-def test_from_no_backend_to_a_backend(index):
+def test_from_no_backend_to_a_backend_that_is_repaired_and_outdated(index, monkeypatch):
     layout = Layout()
     assert not preferences.draw_set_up(layout)
     assert "The backend is not set up yet" in said(layout)
@@ -86,19 +86,25 @@ def test_from_no_backend_to_a_backend(index):
     assert not layout.of("text")
     layout = draw_preferences()
     assert "Ready: torch 0-tiny" in said(layout)
-    assert str(places.set_up_folder().environment)[:40] in said(layout)
+    assert str(places.set_up_folder().environment).replace(" ", "") in said(layout).replace(" ", "")
     assert "primdiffusion.set_up_backend" in layout.of("button")
 
     assert press.set_up_backend() == {"FINISHED"}  # nothing to do
-
-
-def test_repair_installs_again_what_is_damaged(index):
-    assert press.set_up_backend() == {"FINISHED"}
-    assert known().state == "ready"
     next(places.set_up_folder().environment.rglob("tiny.py")).unlink()
     assert press.set_up_backend(repair=True) == {"FINISHED"}
     assert known().state == "ready"
     assert list(places.set_up_folder().environment.rglob("tiny.py"))
+
+    (path,) = ui_setup.available().values()
+    monkeypatch.setattr(ui_setup, "LOCKS", path.parent)
+    path.write_text(path.read_text() + "# another\n")
+    ui_setup.read_once.cache_clear()
+    assert known().state == "outdated"
+    assert "press Repair" in known().line
+    bpy.context.preferences.system.use_online_access = False
+    with refused(RuntimeError, "Blender"):
+        press.set_up_backend(repair=True)
+    assert known().state == "outdated"  # still there, and it works
 
 
 def test_without_online_access_set_up_is_rejected_with_the_remedy(wheels):
@@ -120,20 +126,6 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
     assert "Half installed" in said(layout)
     assert "extensions.userpref_allow_online" not in layout.of("button")
     assert "wm.path_open" in draw_preferences().of("button")
-
-
-def test_an_environment_with_outdated_packages_is_reported(index, monkeypatch):
-    assert press.set_up_backend() == {"FINISHED"}
-    (path,) = ui_setup.available().values()
-    monkeypatch.setattr(ui_setup, "LOCKS", path.parent)
-    path.write_text(path.read_text() + "# another\n")
-    ui_setup.read_once.cache_clear()
-    assert known().state == "outdated"
-    assert "press Repair" in known().line
-    bpy.context.preferences.system.use_online_access = False
-    with refused(RuntimeError, "Blender"):
-        press.set_up_backend(repair=True)
-    assert known().state == "outdated"  # still there, and it works
 
 
 def test_nothing_to_cancel_is_rejected(wheels):

@@ -30,9 +30,10 @@ def run_cases(chosen: str, **environment: str) -> None:
 
 @with_triton
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "chosen", ["overlapping or inside_boxes or one_pixel", pytest.param("", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("chosen", [
+    "(overlapping and (0-settings0 or 1-settings1)) or (inside_boxes and not position1) or 1-33",
+    pytest.param("", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_the_kernels_do_what_the_reference_does_in_the_interpreter(chosen):
     run_cases(chosen, TRITON_INTERPRET="1")
 
