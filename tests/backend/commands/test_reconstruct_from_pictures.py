@@ -39,7 +39,7 @@ def picture(tmp_path_factory):
     model = tiny_model()
     prior = model.denoiser.prior
     human = Human(model.decode((prior.mean + prior.picture(COLOURS[None]))[0]), torch.zeros(10), {})
-    primitives = place(human, standing(1, 55.0).map(lambda values: values[0]))
+    primitives = place(human, standing(55.0, 55.0).map(lambda values: values[0]))
     seen = march(primitives, framing(primitives, 0.0, 96, 128))
     straight = seen.rgb / seen.alpha[..., None].clamp_min(1e-3)
     rgba = torch.cat([encode_srgb(straight.clamp(0, 1)), seen.alpha[..., None]], -1)
