@@ -32,8 +32,9 @@ from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.human import pose_body
 from primdiffusion.reconstruction.posture_fit import Posture, each
 
-_ACROSS = (*((arms, arms, 0.0) for arms in (0.0, 30.0, 55.0, 75.0)), (75.0, -60.0, 0.0), (-60.0, 75.0, 0.0))
-_ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0, 0.0))
+_RAISED = ((75.0, -60.0, 0.0), (-60.0, 75.0, 0.0))
+_ACROSS = (*((arms, arms, 0.0) for arms in (0.0, 30.0, 55.0, 75.0)), *_RAISED)
+_ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0, 0.0), *_RAISED)
 STANCES: Mapping[float, Sequence[tuple[float, float, float]]] = {0: _ACROSS, 90: _ALONG, 180: _ACROSS, 270: _ALONG}
 """What a standing body may look like by the degrees that it is turned to its left: arms and stride of `standing`."""
 FRAMING_STEPS = 4

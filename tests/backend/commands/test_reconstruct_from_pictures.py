@@ -29,7 +29,7 @@ COLOURS = torch.tensor([30.0, -20.0, 5.0])
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     """Few steps in small pictures."""
-    rounds = [from_pictures.Round(48, from_pictures.Stage(8, 0.03), 1)]
+    rounds = [from_pictures.Round(48, from_pictures.Stage(4, 0.03), steps) for steps in (1, 0)]
     monkeypatch.setattr(from_pictures, "ROUNDS", rounds)
 
 
