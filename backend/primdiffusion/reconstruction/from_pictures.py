@@ -133,7 +133,8 @@ def person_in_pictures(
         targets = _targets(photographs, start.posture, ROUNDS[-1].side)
         found = Found(start.posture, _cut_out(_mean_human(model), photographs, targets))
     if pose is None:
-        warnings.append("no pose was given: the person is taken to stand or walk upright")
+        facing = ", facing the camera" if len(photographs) == 1 else ""
+        warnings.append(f"no pose was given: the person is taken to stand upright{facing}")
     quality = fit_quality(model, photographs, found)
     masks_made = tuple(one.whole_mask() for one in found.photographs if one.uncut is not None)
     if masks_made:
@@ -165,7 +166,7 @@ def start_of(
     tilted = views is None or len(views) == 1  # cameras of several pictures belong together
     if known is None:
         found = [
-            _standing(photograph, model, None if views is None else views[i])
+            _standing(photograph, model, None if views is None else views[i], turned=len(photographs) > 1)
             for i, photograph in enumerate(photographs)
         ]
         pictures = [i for i, postures in enumerate(found) for _ in postures]
@@ -182,13 +183,16 @@ def start_of(
     return Start(posture, pictures, POSE_FILE_TIGHTNESS, complete=views is not None, tilted=tilted)
 
 
-def _standing(photograph: Photograph, model: DiffusionModel, view: View | None) -> list[Posture]:
-    """Standing bodies of the turns that fit the outline nearly as well as the best, each in its best stance."""
+def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, turned: bool) -> list[Posture]:
+    """Standing bodies of the turns that fit the outline nearly as well as the best, each in its best stance.
+
+    Not `turned`: a single picture shows a person from the front; outlines tell front from back too seldom.
+    """
     payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
-    for turned, stances in STANCES.items():
+    for degrees, stances in STANCES.items() if turned else [(0, STANCES[0])]:
         tried = []
         for stance in stances:
-            pose = standing(*stance, turned)
+            pose = standing(*stance, degrees)
             lens = photograph.lens() if view is None else view
             posture = Posture(pose, betas, framed([photograph], pose, betas, [lens]))
             tried.append((outline_error(payload, *_targets([photograph], posture, OUTLINE_SIDE)), posture))

@@ -108,11 +108,11 @@ class FitQuality(NamedTuple):
         if self.percent < LEAST_PERCENT:
             what = {
                 "outline": "the outlines of the body and of the mask differ",
-                "colour": "colours within the mask are not those of a person",
+                "colour": "colours within the mask are not those of a person seen from the front",
                 "unexplained": f"{100 * self.unexplained:.0f} % of the mask belongs to no body",
                 "left_out": "too much of the mask was left out",
                 "outside": f"the {self.limb} lies outside of the mask",
-                "hand": "a hand is not where the body has it: it is hidden or cut off",
+                "hand": "a hand is not where the body has it: it is hidden, cut off, or seen from behind",
                 "joint": "a knee or an elbow bends as it cannot",
             }[self.worst]
             warnings.append(
