@@ -13,8 +13,15 @@ nothing else. Over humans:
     front_psnr                                   the human in the picture, over the figure, dB
     fit_seconds_cpu                              CPU time of the fit of the posture
 
+`python benchmarks/upright.py several --assets DIR --json F --sheet F.jpg` makes one human from three pictures, front,
+side and back in different poses by different cameras, and adds to the figures in F:
+
+    several_turn_error_deg                       of the body about the vertical, the largest
+    several_front_psnr, ..._side_psnr, ..._back_psnr    that human in each picture
+    front_only_side_psnr, front_only_back_psnr   a human from the front's picture alone, in the poses of the others
+
 The sheet has a row for each human: the picture, ours in it, ours and the true posture from the side, with the floor
-level.
+level. That of several pictures has a row for each picture: it, the human from all, and that from the front alone.
 """
 
 from __future__ import annotations
@@ -28,14 +35,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from figure_metrics import figure_psnr
-from from_pictures import GREY, SEED
+from from_pictures import GREY, SEED, add, options
 from jaxtyping import Float
 from PIL import ExifTags, Image
 from primdiffusion.body.model import BodyPose, PosedBody, default_body
+from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import FILM_MM, Photograph, read_photographs
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.render import srgb_bytes
 from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.motion import built_in_vectors
@@ -50,10 +59,10 @@ from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.raster.rasterise import figure_from_mesh
 from primdiffusion.reconstruction.from_captures import reconstruct
 from primdiffusion.reconstruction.from_pictures import fit_posture_in, person_in, start_of
-from primdiffusion.reconstruction.posture_fit import Posture
+from primdiffusion.reconstruction.posture_fit import Posture, each
 from primdiffusion.reconstruction.posture_start import views_of
 from primdiffusion.render.march import march
-from record import command_line, report
+from record import report, run
 from torch import Tensor
 
 POSES = ("standing", "A", "hands on hips", "waving", "near T", "walking")
@@ -63,6 +72,8 @@ FIGURE = (0.45, 0.85)
 """Heights of the human as shares of the picture's."""
 MARGIN_PX = 20
 TILE = 256
+SIDES = {"front": 0.0, "side": 100.0, "back": 170.0}
+"""Degrees by which a body is turned in three pictures."""
 
 
 class Case(NamedTuple):
@@ -76,10 +87,7 @@ class Case(NamedTuple):
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--checkpoint", type=Path, help="diffusion model; the default one if omitted")
-    parser.add_argument("--people", type=int, default=8)
+    parser = options(people=8)
     parser.add_argument("--sheet", type=Path, help="picture of the humans")
     arguments = parser.parse_args()
     assets, model = open_assets(arguments.assets, required_meshes()), load_checkpoint(arguments.checkpoint)
@@ -110,11 +118,31 @@ def main() -> None:
     report({name: round(float(value), 3) for name, value in figures.items()} | {"people": len(rows)}, arguments.json)
 
 
-def drawn(assets, number: int, folder: Path, turned: float = 0.0) -> Case:
-    """Draw a human, turned by so many degrees about the vertical, save the picture with alpha, and read it."""
-    person, rng = make_person(assets, load_base_mesh(), SEED + number), np.random.default_rng(number)
+def several() -> None:
+    parser = options(people=3)
+    parser.add_argument("--sheet", type=Path, help="picture of the humans")
+    arguments = parser.parse_args()
+    assets, model = open_assets(arguments.assets, required_meshes()), load_checkpoint(arguments.checkpoint)
+    rows, sheet = [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        for number in range(arguments.people):
+            rows.append(of_sides(model, assets, number, Path(scratch), sheet))
+            print(number, {key: round(value, 2) for key, value in rows[-1].items()}, flush=True)
+    figures = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    figures |= {"several_turn_error_deg": max(row["several_turn_error_deg"] for row in rows)}
+    if arguments.sheet is not None:
+        Image.fromarray(np.concatenate(sheet)).save(arguments.sheet, quality=88)
+    add({name: round(value, 3) for name, value in figures.items()} | {"several_people": len(rows)}, arguments.json)
+
+
+def drawn(assets, number: int, folder: Path, turned: float = 0.0, other: int = 0) -> Case:
+    """Draw a human, turned by so many degrees about the vertical, save the picture with alpha, and read it.
+
+    With `other`, in another pose and by another camera.
+    """
+    person, rng = make_person(assets, load_base_mesh(), SEED + number), np.random.default_rng(number + 1000 * other)
     names = list(built_in_vectors())
-    pose = built_in_poses().map(lambda values: values[names.index(POSES[number % len(POSES)])])
+    pose = built_in_poses().map(lambda values: values[names.index(POSES[(number + other) % len(POSES)])])
     turn = axis_angle_to_matrix(torch.tensor([0.0, math.radians(turned), 0.0]))
     pose = BodyPose(torch.cat([turn @ pose.joint_rotation[:1], pose.joint_rotation[1:]]), pose.translation)
     body = default_body().shape(torch.from_numpy(person.betas).float())
@@ -125,12 +153,37 @@ def drawn(assets, number: int, folder: Path, turned: float = 0.0) -> Case:
     seen = figure_from_mesh(person.mesh).posed(posed.skinning.double().numpy())(view, 3)
     alpha = seen.alpha.clip(0, 1)[..., None]
     straight = srgb_bytes(np.where(alpha > 0, seen.rgb / np.maximum(alpha, 1e-3), 0.1).clip(0, 1))
-    exif, path = Image.Exif(), folder / f"{number}.png"
+    exif, path = Image.Exif(), folder / f"{number}_{other}.png"
     if number % 2:
         exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: round(lens)}
     picture = Image.fromarray(np.concatenate([straight, (255 * alpha).round().astype(np.uint8)], -1))
     picture.save(path, exif=exif)
     return Case(read_photographs([path])[0], posed, view, pitch)
+
+
+def of_sides(model: DiffusionModel, assets, number: int, folder: Path, sheet: list[np.ndarray]) -> dict[str, float]:
+    """Figures of a human from three pictures, whose rows are added to the sheet."""
+    cases = [drawn(assets, number, folder, turned, i) for i, turned in enumerate(SIDES.values())]
+    photographs = [case.photograph for case in cases]
+    posture = fit_posture_in(model, photographs, start_of(photographs, model), lambda: None).posture
+    poses, cameras = list(each(posture.pose)), list(each(posture.camera))
+    front = Posture(posture.pose.map(lambda values: values[:1]), posture.betas, stack(cameras[:1]))
+    humans = reconstruct(model, person_in(photographs, posture)), reconstruct(model, person_in(photographs[:1], front))
+    row = {"several_turn_error_deg": 0.0}
+    for side, case, pose, camera in zip(SIDES, cases, poses, cameras, strict=True):
+        off = abs(heading(pose.joint_rotation[0]) - heading(case.posed.joints[0, :3, :3]))
+        row["several_turn_error_deg"] = max(row["several_turn_error_deg"], min(off, 360 - off))
+        tiles, mask = [true_square(case)], torch.from_numpy(case.photograph.rgba[..., 3]) > 127
+        for name, human in zip(("several", "front_only"), humans, strict=True):
+            tiles.append(picture(human, pose, camera))
+            row[f"{name}_{side}_psnr"] = float(figure_psnr(tiles[-1], tiles[0], mask))
+        sheet.append(tiled(tiles))
+    return row
+
+
+def heading(rotation: Float[Tensor, "3 3"]) -> float:
+    """Degrees by which a body is turned about the vertical."""
+    return math.degrees(math.atan2(rotation[0, 2], rotation[2, 2]))
 
 
 def held_camera(points: Float[np.ndarray, "V 3"], pitch: float, rng: np.random.Generator) -> tuple[View, float]:
@@ -210,7 +263,11 @@ def sheet_row(human: Human, case: Case, posture: Posture) -> np.ndarray:
     shadow = torch.ones(TILE, TILE, 3)
     column, row = pixels.long().clamp(0, TILE - 1).T
     shadow[row, column] = 0.3
-    images = [Image.fromarray((255 * tile).round().to(torch.uint8).numpy()) for tile in [*tiles, shadow]]
+    return tiled([*tiles, shadow])
+
+
+def tiled(tiles: list[Tensor]) -> np.ndarray:
+    images = [Image.fromarray((255 * tile).round().to(torch.uint8).numpy()) for tile in tiles]
     return np.concatenate([np.asarray(image.resize((TILE, TILE), Image.Resampling.BOX)) for image in images], 1)
 
 
@@ -222,4 +279,4 @@ def beside(posed: PosedBody) -> Camera:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, several=several)

@@ -17,7 +17,9 @@ def test_the_example_of_each_name_runs_after_those_before_it(tmp_path, checkpoin
     monkeypatch.chdir(tmp_path)
     np.savez("walk.npz", poses=np.zeros((6, 72)))
     monkeypatch.setattr("primdiffusion.diffusion.checkpoint.default_checkpoint", lambda: checkpoint)
-    monkeypatch.setattr(from_pictures, "ROUNDS", [from_pictures.Round(48, from_pictures.Stage(4, 0.03), 1)])
+    monkeypatch.setattr(
+        from_pictures, "ROUNDS", [from_pictures.Round(48, from_pictures.Stage(2, 0.03), steps) for steps in (1, 0)]
+    )
     names = [name for name in pd.__all__ if inspect.isfunction(getattr(pd, name))]
     parser, seen = doctest.DocTestParser(), {"pd": pd}
     for name in names:

@@ -254,7 +254,7 @@ class Pictures:
     """The person's label in masks of labels: the index in their palette, or else the grey value."""
     pose: Path | None = None
     """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl, .bvh), or a posture.json; without
-    it, the person is taken to stand upright, facing the camera."""
+    it, the person is taken to stand upright, facing the camera; in several pictures, any way."""
     cameras: Path | None = None
     """Cameras of the pictures, as a cameras.json of captures; without it, the lens is that of the EXIF data or a usual
     one, and the distance follows from the person's size in the picture."""

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph, read_photographs
@@ -23,11 +24,11 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.reconstruction.from_captures import PriorFit, targets_of
-from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error, resized
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
 from primdiffusion.reconstruction.posture_start import (
-    STANDING_ARMS,
+    STANCES,
     before_cameras,
     cameras_of,
     framed,
@@ -49,10 +50,20 @@ class Round(NamedTuple):
     coefficient_steps: int
 
 
-ROUNDS = (Round(96, Stage(40, 0.04, upright=False), 2), Round(96, Stage(50, 0.02), 2), Round(192, Stage(40, 0.01), 0))
+ROUNDS = (
+    Round(96, Stage(12, 0.04, upright=False), 0), Round(96, Stage(28, 0.03, upright=False), 2),
+    Round(96, Stage(50, 0.02), 2), Round(192, Stage(40, 0.01), 0),
+)  # fmt: skip
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
-"""Of the pictures that choose a standing body's arms."""
+"""Of the pictures that choose how a standing body stands."""
+LIKELY_START, LIKELY = 1.8, 1.5
+"""How much worse than the best an outline may be for a turn of the body to be tried, and after the first round."""
+FRONT = 30.0
+"""Logarithm of how much more probable a picture from the front is than one from behind: most people show their face,
+and colours tell less before the pose is found exactly."""
+TURN_STEPS = 3
+"""Gauss-Newton steps on coefficients whose evidence tells the turns that are left: a face from hair."""
 OUTLINE_IN_PICTURE = 256
 """Largest side of the drawing of a body over a picture without a mask, pixels."""
 POSE_FILE_TIGHTNESS = 2.0
@@ -65,6 +76,8 @@ class Start:
 
     posture: Posture
     """With cameras of the squares that are kept of pictures."""
+    pictures: Sequence[int]
+    """Which picture each pose is of; a picture may have several, of which one is right."""
     tightness: float
     """See `PostureFit`."""
     complete: bool
@@ -120,7 +133,8 @@ def person_in_pictures(
         targets = _targets(photographs, start.posture, ROUNDS[-1].side)
         found = Found(start.posture, _cut_out(_mean_human(model), photographs, targets))
     if pose is None:
-        warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
+        facing = ", facing the camera" if len(photographs) == 1 else ""
+        warnings.append(f"no pose was given: the person is taken to stand upright{facing}")
     quality = fit_quality(model, photographs, found)
     masks_made = tuple(one.whole_mask() for one in found.photographs if one.uncut is not None)
     if masks_made:
@@ -151,7 +165,13 @@ def start_of(
     views = known and known.views if cameras_path is None else read_cameras(cameras_path, sizes)
     tilted = views is None or len(views) == 1  # cameras of several pictures belong together
     if known is None:
-        return Start(_standing(photographs, model, views), 1.0, complete=False, tilted=tilted)
+        found = [
+            _standing(photograph, model, None if views is None else views[i], turned=len(photographs) > 1)
+            for i, photograph in enumerate(photographs)
+        ]
+        pictures = [i for i, postures in enumerate(found) for _ in postures]
+        posture = _together([one for postures in found for one in postures])
+        return Start(posture, pictures, 1.0, complete=False, tilted=tilted)
     pose = repeated(known.pose, len(photographs))
     betas = model.shapes.bias.clone() if known.betas is None else known.betas
     if views is None:
@@ -159,20 +179,32 @@ def start_of(
         camera = framed(photographs, pose, betas, [photograph.lens() for photograph in photographs])
     else:
         camera = cameras_of(photographs, views)
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=views is not None, tilted=tilted)
+    posture, pictures = Posture(pose, betas, camera), range(len(photographs))
+    return Start(posture, pictures, POSE_FILE_TIGHTNESS, complete=views is not None, tilted=tilted)
 
 
-def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
-    """The standing body whose arms fit the outline best."""
-    components, betas = PriorFit.of(model), model.shapes.bias.clone()
-    payload = components.payload(components.coefficients(components.everyone()))
-    lenses = [photograph.lens() for photograph in photographs] if views is None else views
-    found = []
-    for arms in STANDING_ARMS:
-        pose = standing(len(photographs), arms)
-        found.append(Posture(pose, betas, framed(photographs, pose, betas, lenses)))
-    best = min(found, key=lambda one: outline_error(payload, _targets(photographs, one, OUTLINE_SIDE)))
-    return best if views is None else before_cameras(best, cameras_of(photographs, views))
+def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, turned: bool) -> list[Posture]:
+    """Standing bodies of the turns that fit the outline nearly as well as the best, each in its best stance.
+
+    Not `turned`: a single picture shows a person from the front; outlines tell front from back too seldom.
+    """
+    payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
+    for degrees, stances in STANCES.items() if turned else [(0, STANCES[0])]:
+        tried = []
+        for stance in stances:
+            pose = standing(*stance, degrees)
+            lens = photograph.lens() if view is None else view
+            posture = Posture(pose, betas, framed([photograph], pose, betas, [lens]))
+            tried.append((outline_error(payload, *_targets([photograph], posture, OUTLINE_SIDE)), posture))
+        found.append(min(tried, key=lambda one: one[0]))
+    likely = [found[one][1] for one in _likely([error for error, _ in found], [0] * len(found), LIKELY_START)]
+    return likely if view is None else [before_cameras(one, cameras_of([photograph], [view])) for one in likely]
+
+
+def _together(postures: Sequence[Posture]) -> Posture:
+    """Postures of one shape in one batch."""
+    pose = BodyPose(*(torch.cat(values) for values in zip(*(vars(one.pose).values() for one in postures), strict=True)))
+    return Posture(pose, postures[0].betas, stack([camera for one in postures for camera in each(one.camera)]))
 
 
 def fit_posture_in(
@@ -182,25 +214,52 @@ def fit_posture_in(
 
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PriorFit.of`.
     """
-    components = PriorFit.of(model)
+    components, pictures = PriorFit.of(model), list(start.pictures)
     fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
+
+    def targets(side: int) -> list[PosedView]:
+        return _targets([photographs[picture] for picture in pictures], fit.posture(), side)
+
     for number, (side, stage, coefficient_steps) in enumerate(ROUNDS):
         payload = components.payload(components.coefficients(people))
-        targets = _targets(photographs, fit.posture(), side)
-        if number in (0, len(ROUNDS) - 1):
-            photographs = _cut_out(payload, photographs, targets)
-        if 0 < number == len(ROUNDS) - 1:
-            pairs = zip(photographs, targets, strict=True)
+        if number in (0, len(ROUNDS) - 1) and len(pictures) == len(photographs):
+            photographs = _cut_out(payload, photographs, targets(side))
+        if number == len(ROUNDS) - 1:
+            pairs = zip(photographs, targets(side), strict=True)
             photographs = [
                 one if one.uncut is not None else without_things(payload, one, target) for one, target in pairs
             ]
-        targets = _targets(photographs, fit.posture(), side)
-        fit.refine(payload, targets, stage, on_step)
-        targets = _targets(photographs, fit.posture(), side)
+        several = len(pictures) > len(photographs)
+        fit.refine(payload, targets(side), stage, on_step, shaped=not several)  # a wrong turn would bend the shape
+        if several:
+            if coefficient_steps:
+                away = FRONT * (1 - fit.posture().facing) / 2
+                kept = _likely([_misfit(components, one) for one in targets(side)] + away.numpy(), pictures)
+            else:
+                kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, LIKELY)
+            fit.keep(kept)
+            pictures = [pictures[one] for one in kept]
         for _ in range(coefficient_steps):
-            people = components.closer(people, targets)
+            people = components.closer(people, targets(side))
             on_step()
     return Found(fit.posture(), photographs)
+
+
+def _likely(errors: Sequence[float] | np.ndarray, pictures: Sequence[int], share: float = 1.0) -> list[int]:
+    """Numbers of the errors that are the least of their picture, or less than `share` times as large."""
+    least: dict[int, int] = {}
+    for number, picture in enumerate(pictures):
+        least[picture] = min(least.get(picture, number), number, key=errors.__getitem__)
+    pairs = enumerate(pictures)
+    return [one for one, own in pairs if one == least[own] or errors[one] < share * errors[least[own]]]
+
+
+def _misfit(components: PriorFit, target: PosedView) -> float:
+    """How badly people of any colours explain a picture: a face tells front from back."""
+    people = components.everyone()
+    for _ in range(TURN_STEPS):
+        people = components.closer(people, [target])
+    return -people.evidence
 
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:

@@ -132,6 +132,11 @@ class Posture(TensorRecord):
     camera: Camera
     """[v]."""
 
+    @property
+    def facing(self) -> Float[Tensor, "v"]:
+        """Cosine of the angle at which the body faces the camera: 1 from the front, -1 from behind."""
+        return -(self.camera.world_to_camera[:, 2, :3] * self.pose.joint_rotation[:, 0, :, 2]).sum(-1)
+
     def frames(self) -> list[Frames]:
         """The boxes in each picture."""
         return [default_frames(self.betas, pose) for pose in each(self.pose)]
@@ -183,20 +188,35 @@ class PostureFit:
         """The posture so far."""
         return self._posture()
 
+    def keep(self, numbers: Sequence[int]) -> None:
+        """Go on with these of the pictures alone."""
+        start = self._start
+        pose, camera = (
+            start.pose.map(lambda values: values[numbers]),
+            start.camera.map(lambda values: values[numbers]),
+        )
+        self._start = Posture(pose, start.betas, camera)
+        self._turn, self._move, self._lens, self._tilt = (
+            values[numbers] for values in (self._turn, self._move, self._lens, self._tilt)
+        )
+        self._weights = self._weights[:, numbers]
+
     def refine(
         self,
         payload: Payload,
         targets: Sequence[PosedView],
         stage: Stage,
         on_step: Callable[[], None] | None = None,
+        *,
+        shaped: bool = True,
     ) -> None:
         """Move to where the human's primitives look most like the pictures; deterministic on one machine.
 
         `targets` are of one size, and their cameras those of the posture so far, scaled; their frames do not count.
-        `on_step` is called after each step; an exception that it raises cancels.
+        `on_step` is called after each step; an exception that it raises cancels. `shaped`: betas move too.
         """
         upright = self._tilted and stage.upright
-        unknowns = [self._turn, self._move, self._lens, self._shape, *[self._tilt] * upright]
+        unknowns = [self._turn, self._move, self._lens, *[self._shape] * shaped, *[self._tilt] * upright]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
         pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
@@ -264,10 +284,10 @@ def _difference(
 
 
 @torch.no_grad()
-def outline_error(payload: Payload, targets: Sequence[PosedView]) -> float:
+def outline_error(payload: Payload, target: PosedView) -> float:
     """Mean squared difference of opacity."""
-    drawn = [march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha for target in targets]
-    return float((torch.stack(drawn) - torch.stack([target.rgba[..., 3] for target in targets])).square().mean())
+    drawn = march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha
+    return float((drawn - target.rgba[..., 3]).square().mean())
 
 
 def _encoded(rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 H W"]:

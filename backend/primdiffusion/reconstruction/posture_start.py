@@ -32,8 +32,11 @@ from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.human import pose_body
 from primdiffusion.reconstruction.posture_fit import Posture, each
 
-STANDING_ARMS = (0.0, 30.0, 55.0, 75.0)
-"""Degrees by which the arms of a standing body may be lowered from the T pose."""
+_RAISED = ((75.0, -60.0, 0.0), (-60.0, 75.0, 0.0))
+_ACROSS = (*((arms, arms, 0.0) for arms in (0.0, 30.0, 55.0, 75.0)), *_RAISED)
+_ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0, 0.0), *_RAISED)
+STANCES: Mapping[float, Sequence[tuple[float, float, float]]] = {0: _ACROSS, 90: _ALONG, 180: _ACROSS, 270: _ALONG}
+"""What a standing body may look like by the degrees that it is turned to its left: arms and stride of `standing`."""
 FRAMING_STEPS = 4
 """Distance and place are found together, because near parts look larger."""
 NEAREST, FARTHEST = 1.0, 1e3
@@ -108,11 +111,17 @@ def _at(camera: Camera, translation: Float[Tensor, "3"]) -> Camera:
     )
 
 
-def standing(count: int, arms: float) -> BodyPose:
-    """Upright bodies [count] that face +z, with arms lowered by `arms` degrees from the T pose."""
-    theta = torch.zeros(count, len(JOINT_NAMES), 3)
-    theta[:, JOINT_NAMES.index("left_shoulder"), 2] = -math.radians(arms)
-    theta[:, JOINT_NAMES.index("right_shoulder"), 2] = math.radians(arms)
+def standing(left_arm: float, right_arm: float, stride: float = 0.0, turned: float = 0.0) -> BodyPose:
+    """An upright body [1] that faces +z, turned by so many degrees to its left.
+
+    Arms are lowered by degrees from the T pose; the left leg is lifted forward by `stride` degrees, the right one back.
+    """
+    theta = torch.zeros(1, len(JOINT_NAMES), 3)
+    for joint, axis, degrees in (
+        ("pelvis", 1, turned), ("left_shoulder", 2, -left_arm), ("right_shoulder", 2, right_arm),
+        ("left_hip", 0, -stride), ("right_hip", 0, stride),
+    ):  # fmt: skip
+        theta[0, JOINT_NAMES.index(joint), axis] = math.radians(degrees)
     return BodyPose.from_axis_angle(theta.flatten(1))
 
 

@@ -29,7 +29,7 @@ COLOURS = torch.tensor([30.0, -20.0, 5.0])
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     """Few steps in small pictures."""
-    rounds = [from_pictures.Round(48, from_pictures.Stage(8, 0.03), 1)]
+    rounds = [from_pictures.Round(48, from_pictures.Stage(4, 0.03), steps) for steps in (1, 0)]
     monkeypatch.setattr(from_pictures, "ROUNDS", rounds)
 
 
@@ -39,7 +39,7 @@ def picture(tmp_path_factory):
     model = tiny_model()
     prior = model.denoiser.prior
     human = Human(model.decode((prior.mean + prior.picture(COLOURS[None]))[0]), torch.zeros(10), {})
-    primitives = place(human, standing(1, 55.0).map(lambda values: values[0]))
+    primitives = place(human, standing(55.0, 55.0).map(lambda values: values[0]))
     seen = march(primitives, framing(primitives, 0.0, 96, 128))
     straight = seen.rgb / seen.alpha[..., None].clamp_min(1e-3)
     rgba = torch.cat([encode_srgb(straight.clamp(0, 1)), seen.alpha[..., None]], -1)

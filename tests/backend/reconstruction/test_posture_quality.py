@@ -31,7 +31,7 @@ NONE = FitQuality(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "left forearm")
 
 
 def a_posture() -> Posture:
-    pose, betas = standing(1, 50.0), torch.zeros(10)
+    pose, betas = standing(50.0, 50.0), torch.zeros(10)
     (frames,) = Posture(pose, betas, None).frames()
     camera = framing(Primitives.place(frames, PAYLOAD), 0.0, SIDE, SIDE)
     return Posture(pose, betas, camera.map(lambda values: values[None]))
