@@ -5,7 +5,7 @@ samples of each set with renders of held-out meshes. The --reference folder has 
 `python -m scripts.train_attribute_network --reference DIR --assets DIR`; portraits are kept there. Distances are
 Frechet distances of features; `distance_floor` is that of other meshes, the best that a model can reach; `from_mesh`,
 `payload` and `codec` are what stored humans lose before any network. `attribute_read_*` is the feature network's
-accuracy on renders of held-out meshes. Figures that need an omitted option are null. Times are of two threads.
+accuracy on renders of held-out meshes. Figures that need an omitted option or set are null. Times are of two threads.
 --quick takes few samples of each.
 
 `python benchmarks/diffusion.py pictures --people DIR --neighbours docs/pictures/neighbours.png` renders humans from
@@ -167,6 +167,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--inception", type=Path, help="weights for FID: pt_inception-2015-12-05-6726825d.pth")
     parser.add_argument("--clip", type=Path, help="weights for FID_CLIP: ViT-B/32 as .safetensors")
     parser.add_argument("--count", type=int, default=256, help="samples of each set")
+    parser.add_argument("--sets", nargs="*", choices=SETS, default=SETS, help="sets to compare; default: all")
     parser.add_argument("--quick", action="store_true", help="16 samples of each set, no search among latents")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the table")
@@ -209,6 +210,8 @@ def comparisons(
         sets |= {"voxel": lambda: voxels(baseline, seeds)}
     rows = {"floor": real_vs_real(reference, count)}
     for name, make in sets.items():
+        if name not in arguments.sets:
+            continue
         rows[name] = compare(reference, features_of(reference.network, made_gallery(make())))
         print(name, rows[name], flush=True)
     return {name: rows[name] for name in SETS if name in rows}
