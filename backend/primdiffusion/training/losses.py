@@ -6,22 +6,19 @@ Random numbers are drawn on the device of their generator, which must be that of
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
-from primdiffusion.render.cuda.graph import RecordedLoss
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
 
@@ -47,18 +44,7 @@ def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> 
 
 
 class Objective(ABC):
-    """Loss of one of the denoiser's networks, on a CUDA device recorded with its gradients."""
-
-    name: ClassVar[str]
-    denoiser: PersonDenoiser
-
-    @property
-    def network(self) -> nn.Module:
-        """The network to train."""
-        network = getattr(self.denoiser, self.name)
-        if network is None:
-            raise ValueError("this denoiser was configured without the network that is to be trained: give it a size")
-        return network
+    """Loss of one of the denoiser's networks."""
 
     @abstractmethod
     def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
@@ -66,22 +52,17 @@ class Objective(ABC):
 
     @abstractmethod
     def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch; does not wait for the device."""
+        """Weighted x0 error of a batch."""
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
-        return self._recorded(*self.batch(generator))
-
-    @functools.cached_property
-    def _recorded(self) -> RecordedLoss:
-        return RecordedLoss(self.error, self.network)
+        return self.error(*self.batch(generator))
 
 
 @dataclasses.dataclass
 class PersonObjective(Objective):
     """Loss of the network over person components; cheap, as it needs no latent grids."""
 
-    name = "person"
     denoiser: PersonDenoiser
     coefficients: Float[Tensor, "n r"]
     people: LatentSet
@@ -111,7 +92,6 @@ class PersonObjective(Objective):
 class RestObjective(Objective):
     """Loss of the local network: the rest, given the person network's coefficients."""
 
-    name = "local"
     denoiser: PersonDenoiser
     people: LatentSet
     codec: LinearCodec

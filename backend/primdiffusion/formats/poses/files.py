@@ -121,7 +121,7 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
-    """The motion of a file's arrays, named as in `POSE_KEYS`, axes unchanged. Raises FileError; OSError without a file."""
+    """The motion of a file's arrays, named as in `POSE_KEYS`, axes unchanged. Raises FileError, and OSError."""
     check_motion_size(path, max((array.size for array in arrays.values()), default=0))
     return motion_from_numbers(arrays, str(path))
 
