@@ -29,7 +29,6 @@ from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
-from primdiffusion.training.fit_voxels import fit_missing, voxel_loss
 from primdiffusion.training.loop import Step, Task, train
 from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.state import TrainingState, adamw
@@ -96,9 +95,6 @@ class EncoderTask(Task):
         self.dataset = fit_dataset(captures, config)
         if not len(self.dataset):
             raise ValueError(f"the captures in {config.data} have no frames: render some")
-        if config.fitted is not None and config.loss.voxels:
-            with accelerator.main_process_first():
-                fit_missing(captures, config.architecture, config.fitted)
         self._batches: Iterator[Batch] | None = None
 
     @property
@@ -140,23 +136,16 @@ class EncoderTask(Task):
         with self.accelerator.autocast():
             payload = self.encoder(sample.found, sample.axis_angle)
         payload = payload.to(dtype=torch.float32)
-        terms = {}
-        if number < config.hold_scale or sample.fitted is not None:
+        if number < config.hold_scale:
             # Multiplied by zero, because distributed training needs a gradient of every parameter.
             payload = dataclasses.replace(payload, delta_scale=sample.found.extent + 0 * payload.delta_scale)
-        if sample.fitted is not None:
-            fitted = voxel_loss(payload, sample.fitted, config.architecture.full_density)
-            terms["voxels"] = config.loss.voxels * fitted + 0 * payload.delta_scale.sum()
-        if not config.loss.of_images:
-            return terms
         primitives = Primitives.place(sample.frames, payload)
         views = primitives.map(lambda tensor: tensor[:, None])
         picture = march(views, sample.target.camera, MarchSettings(step=config.step))
         target, mask = sample.target.image.float() / 255, sample.target.mask.float() / 255
-        terms |= loss_terms(
+        return loss_terms(
             encode_srgb(picture.rgb), picture.alpha, primitives.half_extent, target, mask, config.loss, self.perceptual
         )
-        return terms
 
     def held_out(self) -> Mapping[str, float]:
         """Return the PSNR of training subjects and of those held out."""
