@@ -72,16 +72,17 @@ def fit(config: FitConfig) -> EncoderModel:
         with accelerator.main_process_first():
             if accelerator.is_main_process:
                 about = {"captures": dict(captures.about)}
-                begin(config, captures.subjects, about, list(task.phases), accelerator.num_processes)
-        (state,) = train(task, config, accelerator).values()
+                begin(config, captures.subjects, about, accelerator.num_processes)
+        state = train(task, config, accelerator)
         if accelerator.is_main_process and not (config.run / MODEL).exists():
             task.save(state)  # stopped before the first step
         return task.model(state)
 
 
 class EncoderTask(Task):
-    """An encoder in training; its only network has no name, its place in the data is in the state's file."""
+    """An encoder in training; its place in the data is in the state's file."""
 
+    name = ""
     smaller = "fewer --targets, or a smaller --size"
 
     def __init__(self, config: FitConfig, captures: Captures, accelerator: Accelerator) -> None:
@@ -98,22 +99,22 @@ class EncoderTask(Task):
         self._batches: Iterator[Batch] | None = None
 
     @property
-    def phases(self) -> Mapping[str, FitConfig]:
+    def settings(self) -> FitConfig:
         """Return the settings of the run."""
-        return {"": self.config}
+        return self.config
 
-    def network(self, phase: str) -> Encoder:
+    def network(self) -> Encoder:
         """Return the encoder that training starts from."""
         if self.start is not None:
             return self.start.encoder.float().requires_grad_(True).train()
         torch.manual_seed(self.config.seed)
         return Encoder(self.config.architecture)
 
-    def put(self, phase: str, network: nn.Module) -> None:
+    def put(self, network: nn.Module) -> None:
         """Use an encoder."""
         self.encoder = network
 
-    def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
+    def optimiser(self, network: nn.Module) -> torch.optim.Optimizer:
         """An untied bias is used once per image, a weight at every pixel: with equal rates the weights diverge."""
         biases = [module.bias for module in network.modules() if isinstance(module, UntiedConv)]
         known = {id(bias) for bias in biases}

@@ -1,4 +1,4 @@
-"""Objectives of the default denoiser's two networks, and the evaluation error.
+"""Objective of the default denoiser's network, and the evaluation error.
 
 Random numbers are drawn on the device of their generator, which must be that of the samples.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -19,7 +18,7 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 
 LEVELS = (50, 100, 300, 500, 700, 900)
@@ -43,63 +42,24 @@ def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> 
     return (weight / weight.mean(1, keepdim=True) * error.flatten(1).square()).mean()
 
 
-class Objective(ABC):
-    """Loss of one of the denoiser's networks."""
-
-    @abstractmethod
-    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
-        """Draw people and levels, and compute what the network does not change."""
-
-    @abstractmethod
-    def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch."""
-
-    def loss(self, generator: torch.Generator) -> Tensor:
-        """Weighted x0 error of a random batch at random levels."""
-        return self.error(*self.batch(generator))
-
-
 @dataclasses.dataclass
-class PersonObjective(Objective):
-    """Loss of the network over person components; cheap, as it needs no latent grids."""
-
-    denoiser: PersonDenoiser
-    coefficients: Float[Tensor, "n r"]
-    people: LatentSet
-    vocabulary: AttributeVocabulary
-    config: PhaseConfig
-
-    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
-        """Draw noisy coefficients; return them with their closed-form guess, step, condition and the clean ones."""
-        spread = float(self.denoiser.component_std.square().mean().sqrt())
-        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
-        weights, indices = blends(self.people, t, self.config.blend, generator)
-        condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
-        c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
-        y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
-        return y, self.denoiser.likely_coefficients(y, t, condition), t, condition, c
-
-    def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch."""
-        y, likely, t, condition, c = batch
-        signal, noise = self.denoiser.schedule.levels(t, c)
-        std = self.denoiser.component_std
-        std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        return weighted_error((self.denoiser.corrected(y, likely, t, condition) - c) / std, std)
-
-
-@dataclasses.dataclass
-class RestObjective(Objective):
-    """Loss of the local network: the rest, given the person network's coefficients."""
+class RestObjective:
+    """Loss of the local network: the rest, given the closed form's guess of the coefficients."""
 
     denoiser: PersonDenoiser
     people: LatentSet
     codec: LinearCodec
     vocabulary: AttributeVocabulary
-    config: PhaseConfig
+    config: NetworkTraining
+
+    def loss(self, generator: torch.Generator) -> Tensor:
+        """Weighted x0 error of a random batch at random levels."""
+        rest, coefficients, t, condition, clean = self._batch(generator)
+        guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
+        return weighted_error((guess - clean) / std + correction, std)
 
     @torch.no_grad()
-    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+    def _batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
         """Draw noisy people; return their rest, guessed coefficients, step, condition and clean rest."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
@@ -114,15 +74,9 @@ class RestObjective(Objective):
         y, rest = self.denoiser.prior.split(x, signal)
         return rest, self.denoiser.coefficients(y, t, condition), t, condition, clean
 
-    def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch."""
-        rest, coefficients, t, condition, clean = batch
-        guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
-        return weighted_error((guess - clean) / std + correction, std)
-
 
 def random_steps(
-    schedule: Schedule, count: int, generator: torch.Generator, config: PhaseConfig, spread: float = 1.0
+    schedule: Schedule, count: int, generator: torch.Generator, config: NetworkTraining, spread: float = 1.0
 ) -> Int[Tensor, "b"]:
     """Random steps, distributed as `config.levels` says: uniform in t is the paper's (eq. 9).
 
