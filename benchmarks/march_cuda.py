@@ -33,7 +33,8 @@ from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu.march import count_samples
-from primdiffusion.render.cuda.march import available, march_cuda
+from primdiffusion.render.cuda import available
+from primdiffusion.render.cuda.march import march_cuda
 from primdiffusion.render.cuda.scene import Shapes
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
+from primdiffusion.render.cuda import triton_boxes, triton_lists, triton_march
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
 LIST_LIMIT = 1 << 24
@@ -133,9 +134,6 @@ class Packed(NamedTuple):
     @classmethod
     def of(cls, rgb: Tensor, density: Tensor) -> Packed:
         """Pack these contents."""
-        # triton is optional
-        from primdiffusion.render.cuda import triton_boxes
-
         people, boxes = rgb.shape[:2]
         bounds = torch.empty((people, boxes, 8), dtype=torch.int32, device=rgb.device)
         packed = cls(torch.empty((people, boxes, 512, 4), device=rgb.device), bounds)
@@ -211,9 +209,6 @@ def _lattice(spacing: float, thresholds: tuple[float, ...], device: torch.device
 
 def place(scene: Scene, packed: Packed, geometry: list[Tensor], intrinsics: Tensor, world_to_camera: Tensor) -> Placed:
     """Place the boxes, whose position, rotation and half extent are `geometry`, as each view sees them."""
-    # triton is optional
-    from primdiffusion.render.cuda import triton_boxes, triton_lists
-
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     (p, k), b, device = geometry[0].shape[:2], len(intrinsics), intrinsics.device
     totals = torch.zeros(triton_boxes.TOTALS, dtype=torch.int64, device=device)
@@ -250,9 +245,6 @@ def march_constants(shapes: Shapes, sets: int, gap: int) -> dict[str, int]:
 
 def draw(scene: Scene, packed: Packed, placed: Placed, plan: Plan) -> tuple[Picture, Kept]:
     """List the boxes by tile, and march."""
-    # triton is optional
-    from primdiffusion.render.cuda import triton_march
-
     shapes, height, width, device = scene.shapes, scene.camera.height, scene.camera.width, placed.record.device
     (p, k), b, keep = packed.bounds.shape[:2], len(placed.record), scene.keep or scene.index_order
     rgb = torch.empty((b, height, width, 3), device=device)
@@ -283,9 +275,6 @@ def draw(scene: Scene, packed: Packed, placed: Placed, plan: Plan) -> tuple[Pict
 
 def _list(scene: Scene, plan: Plan, placed: Placed, order: Int[Tensor, "b k"]) -> _Lists:
     """List the boxes of each tile, or bin, in `order`."""
-    # triton is optional
-    from primdiffusion.render.cuda import triton_lists
-
     (b, k), device = order.shape, order.device
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     across, down = -(-width // shapes.tile[0]), -(-height // shapes.tile[1])
