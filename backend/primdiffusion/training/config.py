@@ -136,7 +136,7 @@ class TrainingConfig(RunSettings):
     """Fraction of geometries, with all their colour variants, held out for evaluation."""
     more_data: Path | None = None
     """More humans, of `payloads --making from_mesh`: cheap, so they can be many, but blurred. The default preset learns
-    from them what noise does not hide: the closed form, and its networks at levels above t = 300."""
+    from them what noise does not hide: the closed form, and its network at levels above t = 300."""
     preset: Literal["default", "paper"] = "default"
     """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
     made_of: Literal["makehuman", "own"] = "own"
@@ -148,8 +148,8 @@ class TrainingConfig(RunSettings):
     """Timesteps in sampling: trailing (evenly spaced; for the paper preset), dense (denser at low noise) or early (down
     to t = 50, from which the mean is taken; for the default preset)."""
     start_from: Path | None = None
-    """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and sizes of
-    networks are kept, and the networks start with its weights."""
+    """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and size of the
+    network are kept, and the network starts with its weights."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: LocalUNetConfig = dataclasses.field(default_factory=LocalUNetConfig)
