@@ -1,13 +1,15 @@
 """Speed and exactness of the marcher on a CUDA device, for one person of 1024 boxes that fills the frame.
 
 `python benchmarks/march_cuda.py --json march_cuda.json` prints and writes one flat object. Milliseconds are medians
-between CUDA events around whole calls, including launches and the wait for checks; cuda_launch_share is the part of
-cuda_forward in which no kernel runs. The ceilings are measured on the same device in the
+between CUDA events around whole calls, including launches and the wait for checks: cuda_forward of a prepared scene
+(`Marcher`), cuda_march of `march_cuda` called again and again, cuda_eager of `march_cuda` without graphs, cuda_training
+of a forward and a backward pass in one graph. cuda_pipelined is the time of a picture out of many in a row, and
+cuda_launch_share the part of cuda_forward in which no kernel runs. The ceilings are measured on the same device in the
 same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, without reuse, 128 bytes of voxels.
 
-`--cases` also runs the tests of the marcher on the device, `--kernels` prints the time of each kernel, `--sweep` that
-of different program shapes. A part that fails prints its traceback, and the others go on; figures are written after
-each. All but the sweep should take less than eight minutes.
+`--train` also times training steps (`train_cuda.py`), `--cases` runs the tests of the marcher on the device,
+`--kernels` prints the time of each kernel, `--sweep` that of different program shapes. A part that fails prints its
+traceback, and the others go on; figures are written after each. All but the sweep should take less than eight minutes.
 
 It needs a CUDA device, torch for CUDA, the triton that this torch requires, and the package's own requirements; nothing
 is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda.py`. `--write-person FILE` on any
@@ -17,6 +19,7 @@ machine, and `--person FILE` on the one with the device, spare the latter the pa
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import os
 import statistics
@@ -34,10 +37,12 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu.march import count_samples
 from primdiffusion.render.cuda import available
+from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda.march import march_cuda
+from primdiffusion.render.cuda.marcher import Marcher
 from primdiffusion.render.cuda.scene import Shapes
 from primdiffusion.render.image import Rendering
-from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings
+from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings
 from primdiffusion.render.reference import march_reference
 from record import command_line, report
 from torch import Tensor
@@ -100,7 +105,24 @@ def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camer
 
 
 def forward_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, shapes: Shapes = Shapes()) -> float:  # noqa: B008
-    return median_ms(lambda: march_cuda(boxes, camera, settings, None, shapes))
+    marcher = Marcher(boxes, settings, shapes)
+    return median_ms(lambda: marcher(camera))
+
+
+def march_ms(boxes: Primitives, camera: Camera, settings: MarchSettings) -> float:
+    with torch.no_grad():
+        return median_ms(lambda: march_cuda(boxes, camera, settings))
+
+
+def pipelined_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, pictures: int = 50) -> float:
+    """Milliseconds of each of many pictures in a row."""
+    marcher = Marcher(boxes, settings)
+
+    def draw() -> None:
+        for _ in range(pictures):
+            marcher(camera)
+
+    return median_ms(draw, 5, 1) / pictures
 
 
 def kernels_ms(call: Callable[[], object], repeats: int = 20) -> tuple[float, str]:
@@ -119,15 +141,63 @@ def kernels_ms(call: Callable[[], object], repeats: int = 20) -> tuple[float, st
     return total, events.table(sort_by="self_cuda_time_total", row_limit=25, max_name_column_width=60)
 
 
+def step_of(settings: MarchSettings, camera: Camera) -> Callable[..., tuple[Tensor, ...]]:
+    """A loss of every output, and the gradients of the boxes."""
+
+    def step(*fields: Tensor) -> tuple[Tensor, ...]:
+        own = [field.detach().requires_grad_() for field in fields]
+        picture = march_cuda(Primitives(*own), camera, settings)
+        depth = torch.where(torch.isfinite(picture.depth), picture.depth, 0)
+        loss = picture.rgb.square().mean() + picture.alpha.square().mean() + depth.square().mean()
+        return loss.detach(), *torch.autograd.grad(loss, own)
+
+    return step
+
+
+def graphs() -> Figures:
+    """Whether graphs draw the same bits as launches from Python, and the time of a training step as one graph."""
+    figures: Figures = {}
+    boxes, camera = scene(512)
+    fields = tuple(vars(boxes).values())
+    for name, settings in (
+        ("", DEFAULT),
+        ("_1mm", FINE),
+        ("_released", dataclasses.replace(RELEASED, pixel_centre=0.5)),
+    ):
+        step = step_of(settings, camera)
+        recorded = cuda_graph.Recorded(step)
+        marcher = Marcher(boxes, settings)
+        alone = step(*fields)
+        same = [all(map(torch.equal, alone, recorded(*fields))) for _ in range(4)]
+        eager = march_cuda(leaves(boxes), camera, settings)
+        for _ in range(4):
+            drawn = (marcher(camera), march_cuda(boxes, camera, settings))
+            same += [torch.equal(one.rgb, eager.rgb) and torch.equal(one.depth, eager.depth) for one in drawn]
+        figures[f"cuda_graph_same_bits{name}"] = all(same)
+        print(f"same bits{name}: {same}", flush=True)
+        figures[f"cuda_training{name}_ms"] = median_ms(functools.partial(recorded, *fields), 30)
+        figures[f"cuda_training_eager{name}_ms"] = median_ms(functools.partial(step, *fields), 30)
+        print({key: value for key, value in figures.items() if name in key}, flush=True)
+    return figures
+
+
 def launches() -> Figures:
-    """The time of kernels in a picture, and the share of its time in which none runs."""
+    """The calls that do without a prepared scene, and the share of a picture's time in which no kernel runs."""
     figures: Figures = {}
     for size in (256, 512):
         boxes, camera = scene(size)
-        busy, _ = kernels_ms(lambda boxes=boxes, camera=camera: march_cuda(boxes, camera))
+        marcher = Marcher(boxes, DEFAULT)
+        busy, _ = kernels_ms(lambda marcher=marcher, camera=camera: marcher(camera))
+        whole = median_ms(lambda marcher=marcher, camera=camera: marcher(camera))
         figures[f"cuda_kernels_{size}_ms"] = busy
-        share = max(0.0, 1 - busy / forward_ms(boxes, camera, DEFAULT))
-        figures["cuda_launch_share" if size == 512 else f"cuda_launch_share_{size}"] = share
+        figures["cuda_launch_share" if size == 512 else f"cuda_launch_share_{size}"] = max(0.0, 1 - busy / whole)
+        figures[f"cuda_pipelined_{size}_ms"] = pipelined_ms(boxes, camera, DEFAULT)
+        figures[f"cuda_march_{size}_ms"] = march_ms(boxes, camera, DEFAULT)
+        cuda_graph.ENABLED = False
+        try:
+            figures[f"cuda_eager_{size}_ms"] = march_ms(boxes, camera, DEFAULT)
+        finally:
+            cuda_graph.ENABLED = True
     return figures
 
 
@@ -215,11 +285,9 @@ def gradients(draw: Callable[..., Rendering], boxes: Primitives, camera: Camera)
 def print_kernels() -> None:
     """Print the time of each kernel in a picture, and in a step of forward and backward pass, from the profiler."""
     boxes, camera = scene(512)
-    calls = {
-        "forward": lambda: march_cuda(boxes, camera, DEFAULT),
-        "training": lambda: gradients(march_cuda, boxes, camera),
-    }
-    for name, call in calls.items():
+    marcher, recorded = Marcher(boxes, DEFAULT), cuda_graph.Recorded(step_of(DEFAULT, camera))
+    fields = tuple(vars(boxes).values())
+    for name, call in (("forward", lambda: marcher(camera)), ("training", lambda: recorded(*fields))):
         total, table = kernels_ms(call)
         print(f"{name}: {total:.4f} ms of kernels\n{table}", flush=True)
 
@@ -234,6 +302,13 @@ def cases() -> Figures:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200)
     print(done.stdout[-6000:], done.stderr[-2000:], flush=True)
     return {"cuda_cases_pass": done.returncode == 0}
+
+
+def training() -> Figures:
+    """Milliseconds of training steps."""
+    from train_cuda import training_figures
+
+    return {**training_figures(kernels_ms)}
 
 
 def variants() -> Iterator[Shapes]:
@@ -264,6 +339,7 @@ def print_sweep() -> None:
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--cases", action="store_true", help="also run the tests of the marcher on the device")
+    parser.add_argument("--train", action="store_true", help="also time training steps")
     parser.add_argument("--kernels", action="store_true", help="also print the time of each kernel")
     parser.add_argument("--sweep", action="store_true", help="also print the times of other program shapes")
     parser.add_argument("--write-person", type=Path, help="only write the person of the scene there")
@@ -277,8 +353,8 @@ def main() -> None:
     if arguments.person:
         made.update(torch.load(arguments.person, weights_only=True))
     figures: Figures = {}
-    parts = [exactness, speed, launches]
-    more = ((cases, "cases"), (print_kernels, "kernels"), (print_sweep, "sweep"))
+    parts = [exactness, graphs, speed, launches]
+    more = ((training, "train"), (cases, "cases"), (print_kernels, "kernels"), (print_sweep, "sweep"))
     parts += [part for part, name in more if getattr(arguments, name)]
     failed = []
     for part in parts:

@@ -9,12 +9,15 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.cuda import graph as cuda_graph
+from primdiffusion.render.cuda import marcher as cuda_marcher
 from primdiffusion.render.cuda import scene as cuda_scene
-from primdiffusion.render.cuda.march import march_cuda
-from primdiffusion.render.cuda.scene import Shapes
+from primdiffusion.render.cuda.march import Shapes, march_cuda
+from primdiffusion.render.cuda.marcher import Marcher
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.reference import march_reference
+from support import graphs
 from support.errors import refused
 from torch import Tensor
 
@@ -367,6 +370,136 @@ def test_voxels_without_density_receive_the_gradient_of_their_limit():
         grads.append(leaf.density.grad)
     assert grads[1].norm() > 0
     assert (grads[0] - grads[1]).norm() < 1e-4 * grads[1].norm()
+
+
+SMALL_TILES = dataclasses.replace(WIDE, tile=(4, 4), bin=2)
+
+
+@pytest.fixture
+def no_plans(monkeypatch):
+    """Forget the scenes drawn so far, and leave little room in lists."""
+    monkeypatch.setattr(cuda_scene, "_plans", {})
+    monkeypatch.setattr(cuda_marcher, "_marchers", {})
+    monkeypatch.setattr(cuda_scene, "MULTIPLE", 1 if INTERPRETED else 16)
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """Launches are recorded, in the interpreter as well, where repetitions launch them again: these are returned."""
+    return graphs.on_processors(monkeypatch) if INTERPRETED else None
+
+
+def grown(boxes: Primitives, factor: float = 10.0) -> Primitives:
+    return dataclasses.replace(boxes, half_extent=boxes.half_extent * factor)
+
+
+@pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
+def test_a_scene_that_grows_tenfold_between_two_calls_is_drawn_as_if_it_were_the_first(
+    settings, no_plans, recorded, monkeypatch
+):
+    small, camera = mixed_sizes(6 // BOXES, 40, 60.0), camera_at((0.2, 0.1, 0.9), fov=0.6, width=20, height=16)
+    small = dataclasses.replace(small, half_extent=small.half_extent * 0.15)
+
+    def bits(boxes: Primitives) -> list[Tensor]:
+        picture = list(vars(draw(boxes, camera, settings, shapes=SMALL_TILES)).values())
+        if INTERPRETED:
+            return picture
+        records = single(batch(boxes)), single(batch(camera))
+        found = gradients(lambda b, c: march_cuda(b, c, settings, shapes=SMALL_TILES), *records)
+        return [*picture, *found.values()]
+
+    first = bits(grown(small))
+    needed = dict(cuda_scene._plans)
+    monkeypatch.setattr(cuda_scene, "_plans", {})
+    before = draw(small, camera, settings, shapes=SMALL_TILES)
+    ((kind, plan),) = cuda_scene._plans.items()
+    assert needed[kind].tiles >= 4 * plan.tiles
+    assert all(torch.equal(a, b) for a, b in zip(first, bits(grown(small)), strict=True))
+    assert cuda_scene._plans == needed
+    assert torch.equal(draw(small, camera, settings, shapes=SMALL_TILES).rgb, before.rgb)
+
+
+@pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
+def test_a_prepared_scene_draws_the_bits_of_the_marcher_for_every_camera_size_and_change(settings, no_plans, recorded):
+    boxes = single(batch(mixed_sizes(6 // BOXES, 41, 60.0)))
+    boxes = dataclasses.replace(boxes, half_extent=boxes.half_extent * 0.5)
+    marcher = Marcher(boxes, settings, SMALL_TILES)
+    views = [camera_at((x, 0.1, 0.6), fov=0.5, width=16, height=12) for x in (0.2, -0.3, 0.1, 0.0, 0.3)]
+    views += [camera_at((0.2, 0.1, 0.6), fov=0.5, width=11, height=7)] * 3 + views[:2]
+    for number, view in enumerate(views):
+        if INTERPRETED and number not in (0, 1, 3, 5):
+            continue
+        if number in (3, 8):
+            boxes.half_extent.mul_(3.0)
+            boxes.rgb.mul_(0.9)
+        camera = single(batch(view))
+        got = marcher(camera)
+        expected = march_cuda(boxes.map(lambda tensor: tensor.requires_grad_()), camera, settings, shapes=SMALL_TILES)
+        boxes.map(lambda tensor: tensor.requires_grad_(False))
+        for name, value in vars(expected).items():
+            assert torch.equal(getattr(got, name), value), (number, name)
+        again = march_cuda(boxes, camera, settings, shapes=SMALL_TILES)  # as graphs, on a device
+        assert torch.equal(again.rgb, expected.rgb), number
+    assert not INTERPRETED or sum(graph.replays for graph in recorded) > 4
+    marcher.show(boxes.map(lambda tensor: tensor.flip(1)))
+    flipped = marcher(camera)
+    assert (flipped.alpha - got.alpha).abs().max() < 1e-5
+    assert not torch.equal(flipped.rgb, got.rgb) or settings is ROUGH
+
+
+def test_pictures_stay_when_the_prepared_scene_draws_the_next_one(no_plans, recorded):
+    marcher = Marcher(single(batch(mixed_sizes(3, 42, 60.0))), ROUGH, WIDE)
+    here, there = (single(batch(camera_at((x, 0.1, 0.6), fov=0.5, width=9, height=8))) for x in (0.2, -0.3))
+    pictures = [marcher(here) for _ in range(3)]
+    copies = [picture.rgb.clone() for picture in pictures]
+    marcher(there)
+    assert all(torch.equal(picture.rgb, copy) for picture, copy in zip(pictures, copies, strict=True))
+
+
+def test_a_prepared_scene_refuses_what_the_marcher_refuses_and_goes_on(no_plans, recorded):
+    boxes, camera = single(batch(random_boxes(2))), single(batch(camera_at((0.0, 0.0, 0.5))))
+    marcher = Marcher(boxes, ROUGH, WIDE)
+    for _ in range(2):
+        sound = [marcher(camera).rgb for _ in range(3)][-1]
+        with refused(ValueError, "camera.world_to_camera", "scales"):
+            marcher(dataclasses.replace(camera, world_to_camera=camera.world_to_camera * 2))
+        boxes.density[0, 1, 3] = torch.nan
+        with refused(ValueError, "primitives.density", "NaN"):
+            marcher(camera)
+        boxes.density[0, 1, 3] = 1.0
+    assert torch.isfinite(sound).all()
+    with refused(ValueError, "float32"):
+        marcher(camera.to(dtype=torch.float64))
+
+
+def step_of(settings: MarchSettings, target: Tensor):
+    """A loss of a picture, and its gradients."""
+
+    def step(*tensors: Tensor) -> tuple[Tensor, ...]:
+        leaves = [tensor.detach().requires_grad_() for tensor in tensors[:5]]
+        camera = Camera(*tensors[5:], width=8, height=8)
+        picture = march_cuda(Primitives(*leaves), camera, settings, shapes=SMALL_TILES)
+        loss = (picture.rgb - target).square().sum() + picture.alpha.sum()
+        return loss, *torch.autograd.grad(loss, leaves)
+
+    return step
+
+
+@pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
+def test_gradients_are_the_same_bits_when_recorded_and_again_when_the_scene_outgrows_the_recording(
+    settings, no_plans, recorded
+):
+    boxes, camera = mixed_sizes(6 // BOXES, 43, 60.0), camera_at((0.2, 0.1, 0.9), fov=0.6, width=8, height=8)
+    boxes, camera = single(batch(boxes)), single(batch(camera))
+    step = step_of(settings, torch.full((1, 8, 8, 3), 0.3, device=DEVICE))
+    repeated, expected = cuda_graph.Recorded(step), {}
+    for factor in (0.15, 0.15, 1.5, 1.5) if INTERPRETED else (0.15, 0.15, 0.16, 0.15, 1.5, 1.5, 1.4, 0.15):
+        inputs = [*vars(grown(boxes, factor)).values(), camera.intrinsics, camera.world_to_camera]
+        got = [tensor.clone() for tensor in repeated(*inputs)]
+        expected[factor] = expected[factor] if factor in expected else step(*inputs)
+        assert all(torch.equal(a, b) for a, b in zip(got, expected[factor], strict=True)), factor
+    # twice as it was, once too small for the third, then anew
+    assert not INTERPRETED or [graph.replays for graph in recorded] == [2, 1]
 
 
 @pytest.mark.parametrize("name", ["position", "rotation", "half_extent", "rgb", "density"])

@@ -19,9 +19,11 @@ from torch import Tensor
 
 from primdiffusion.formats.requests import Count, NotNegative, RayStep
 from primdiffusion.formats.schema import Checked, Range
+from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
-from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.cuda.graph import Recorded
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import MarchSettings, Rendering, march
 from primdiffusion.runtime.failures import PictureOutOfMemory, out_of_memory
@@ -90,18 +92,25 @@ def descend(
     chosen = _chosen(views, settings)
     covered = sum(float(view.rgba[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
 
-    for number in range(1, settings.steps + 1):
+    def gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
+        own = _Leaves(*(leaf.detach().requires_grad_() for leaf in tensors[:3]))
+        shown = [_view(*tensors[first : first + 6]) for first in range(3, len(tensors), 6)]
         with torch.enable_grad():
-            payload = leaves.payload(start)
-            shown = itertools.islice(chosen, settings.views)
+            payload = own.payload(start)
             loss = torch.stack([_loss(view, payload, settings) for view in shown]).mean() / covered
             if settings.pull:
-                far = [(leaf - began).square().sum() for leaf, began in zip(leaves, first, strict=True)]
+                far = [(leaf - began).square().sum() for leaf, began in zip(own, first, strict=True)]
                 loss = loss + settings.pull * torch.stack(far).sum() / covered
-        value = float(loss.detach())
+        return loss.detach(), *torch.autograd.grad(loss, own)
+
+    recorded = Recorded(gradients)
+    for number in range(1, settings.steps + 1):
+        shown = itertools.islice(chosen, settings.views)
+        loss, *found = recorded(*leaves, *itertools.chain.from_iterable(map(_tensors, shown)))
+        value = float(loss)
         if not math.isfinite(value):
             raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
-        for leaf, gradient in zip(leaves, torch.autograd.grad(loss, leaves), strict=True):
+        for leaf, gradient in zip(leaves, found, strict=True):
             leaf.grad = gradient
         adam.step()
         fall.step()
@@ -156,6 +165,19 @@ def _chosen(views: Sequence[PosedView], settings: DescentSettings) -> Iterator[P
             view = views[number]
             left, top = draws.integers(stride, size=2).tolist()
             yield PosedView(view.frames, view.camera.every(stride, left, top), view.rgba[top::stride, left::stride])
+
+
+def _tensors(view: PosedView) -> tuple[Tensor, ...]:
+    return *vars(view.frames).values(), view.camera.intrinsics, view.camera.world_to_camera, view.rgba
+
+
+def _view(
+    position: Tensor, rotation: Tensor, half_extent: Tensor, intrinsics: Tensor, world_to_camera: Tensor, rgba: Tensor
+) -> PosedView:
+    """The view of these `_tensors`."""
+    height, width = rgba.shape[:2]
+    camera = Camera(intrinsics, world_to_camera, width, height)
+    return PosedView(Frames(position, rotation, half_extent), camera, rgba)
 
 
 def _share_of_rate(done: int, settings: DescentSettings) -> float:

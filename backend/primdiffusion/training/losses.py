@@ -6,6 +6,7 @@ Random numbers are drawn on the device of their generator, which must be that of
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 
@@ -18,6 +19,7 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
+from primdiffusion.render.cuda.graph import RecordedLoss
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 
@@ -44,7 +46,10 @@ def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> 
 
 @dataclasses.dataclass
 class RestObjective:
-    """Loss of the local network: the rest, given the closed form's guess of the coefficients."""
+    """Loss of the local network: the rest, given the closed form's guess of the coefficients.
+
+    On a CUDA device it is recorded with its gradients.
+    """
 
     denoiser: PersonDenoiser
     people: LatentSet
@@ -54,12 +59,15 @@ class RestObjective:
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
-        rest, coefficients, t, condition, clean = self._batch(generator)
-        guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
-        return weighted_error((guess - clean) / std + correction, std)
+        return self._recorded(*self.batch(generator))
+
+    @functools.cached_property
+    def _recorded(self) -> RecordedLoss:
+        assert self.denoiser.local is not None
+        return RecordedLoss(self.error, self.denoiser.local)
 
     @torch.no_grad()
-    def _batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
         """Draw noisy people; return their rest, guessed coefficients, step, condition and clean rest."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
@@ -73,6 +81,12 @@ class RestObjective:
         _, clean = self.denoiser.prior.split(z)
         y, rest = self.denoiser.prior.split(x, signal)
         return rest, self.denoiser.coefficients(y, t, condition), t, condition, clean
+
+    def error(self, *batch: Tensor) -> Tensor:
+        """Weighted x0 error of a batch; does not wait for the device."""
+        rest, coefficients, t, condition, clean = batch
+        guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
+        return weighted_error((guess - clean) / std + correction, std)
 
 
 def random_steps(

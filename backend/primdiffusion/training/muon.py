@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from primdiffusion.render.cuda.graph import Recorded
+
 BETAS = (0.9, 0.99)
 """Decay of AdamW's two moments."""
 ENDS = ("inner", "outer", "asked")
@@ -31,40 +33,52 @@ class MuonAdamW(torch.optim.Optimizer):
         }
         own = [parameter for parameter in network.parameters() if parameter in hidden]
         others = [parameter for parameter in network.parameters() if parameter not in hidden]
+        # The learning rate scales changes afterwards: in a recording it would be a constant.
         self._muon = torch.optim.Muon(
-            [_matrix(parameter.detach()) for parameter in own],
-            lr=learning_rate, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw",
+            [torch.zeros_like(_matrix(parameter.detach())) for parameter in own],
+            lr=1.0, weight_decay=0.0, adjust_lr_fn="match_rms_adamw",
         )  # fmt: skip
+        self._recorded, self._weight_decay = Recorded(self._changes), weight_decay
         self._adamw = torch.optim.AdamW(others, lr=learning_rate, weight_decay=weight_decay, betas=BETAS)
         super().__init__([{"params": own, "factor": FACTOR}, {"params": others, "factor": 1.0}], {"lr": learning_rate})
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:
         """Update all parameters by their gradients; there is no `closure`."""
-        for optimiser, group in zip((self._muon, self._adamw), self.param_groups, strict=True):
-            optimiser.param_groups[0]["lr"] = group["lr"]
-        for matrix, parameter in self._pairs():
-            assert parameter.grad is not None
-            matrix.data, matrix.grad = _matrix(parameter.detach()), _matrix(parameter.grad)
-        self._muon.step()
+        own, others = self.param_groups
+        self._adamw.param_groups[0]["lr"] = others["lr"]
         self._adamw.step()
-        for matrix, parameter in self._pairs():
-            self.state[parameter] = self._muon.state[matrix]
+        if own["params"]:
+            changes = self._recorded(*(_matrix(parameter.grad) for parameter in own["params"]))
+            matrices = [_matrix(parameter) for parameter in own["params"]]
+            torch._foreach_mul_(matrices, 1 - own["lr"] * self._weight_decay)  # pyright: ignore[reportPrivateImportUsage]
+            torch._foreach_add_(matrices, changes, alpha=own["lr"])  # pyright: ignore[reportPrivateImportUsage]
+        for change, parameter in self._pairs():
+            self.state[parameter] = self._muon.state[change]
         for parameter in self._adamw.param_groups[0]["params"]:
             self.state[parameter] = self._adamw.state[parameter]
+
+    def _changes(self, *gradients: Tensor) -> tuple[Tensor, ...]:
+        """Changes of the matrices at a learning rate of 1; updates their momenta."""
+        changes = self._muon.param_groups[0]["params"]
+        for change, gradient in zip(changes, gradients, strict=True):
+            change.zero_().grad = gradient
+        self._muon.step()
+        return tuple(changes)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         super().load_state_dict(state_dict)
-        for matrix, parameter in self._pairs():
+        self._recorded = Recorded(self._changes)
+        for change, parameter in self._pairs():
             if parameter in self.state:
-                self._muon.state[matrix] = self.state[parameter]
+                self._muon.state[change] = self.state[parameter]
         for parameter in self._adamw.param_groups[0]["params"]:
             if parameter in self.state:
                 self._adamw.state[parameter] = self.state[parameter]
 
     def _pairs(self) -> list[tuple[Tensor, Tensor]]:
-        """The hidden layers' weights as matrices, which share their memory, each with its parameter."""
+        """Muon's changes, each with the parameter that it is for."""
         return list(zip(self._muon.param_groups[0]["params"], self.param_groups[0]["params"], strict=True))
 
 

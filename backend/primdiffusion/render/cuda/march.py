@@ -1,7 +1,7 @@
 """The fast marcher for CUDA devices: Triton kernels, float32, batched, with a hand-written adjoint (SPEC 4).
 
 The same rule as `reference.py`. Triton compiles the kernels on first use and caches them on disk. `scene` launches the
-forward pass.
+forward pass, and `marcher` repeats it as graphs.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from torch.autograd.function import once_differentiable
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
+from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
 from primdiffusion.render.cuda import triton_adjoint
-from primdiffusion.render.cuda.scene import BOX_FIELDS, Packed, Picture, Plan, Scene, Shapes, check, launch
+from primdiffusion.render.cuda.marcher import prepared
+from primdiffusion.render.cuda.scene import BOX_FIELDS, Packed, Picture, Scene, Shapes, check, launch
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
@@ -37,18 +39,23 @@ def march_cuda(
 
     `primitives` have one leading dimension, 1 or B (1: all views see the same boxes), `camera` and `span` B.
     Differentiable once in every tensor of primitives and camera. Images and gradients are deterministic. Voxel
-    gradients are summed in tf32 (eleven significant bits per term). Waits for the device until the boxes are placed,
-    for checks and the lengths of lists. Memory beyond inputs and outputs: 9 KB per box, and 16 bytes for each tile that
-    a box touches, at most `LIST_LIMIT` of them; with gradients 40 bytes per pixel, and during the backward pass another
-    32 per pixel and 8 KB for every 512 pixels of a box (for more pixels in larger images). In index order 40 bytes per
-    pixel even without gradients, and lists twice.
+    gradients are summed in tf32 (eleven significant bits per term). Waits for the device only until the boxes are
+    placed, for checks, while the picture is being drawn (see `cuda_scene`). Without gradients and span, calls for as
+    many boxes as an earlier one are launched as graphs, by a `Marcher` that stays in memory. Memory beyond inputs and
+    outputs: 9 KB per box, and 20 bytes for each tile that a box touches, at most `LIST_LIMIT` of them; with gradients
+    40 bytes per pixel, and during the backward pass another 32 per pixel and 8 KB for every 512 pixels of a box (for
+    more pixels in larger images). In index order 40 bytes per pixel even without gradients, and lists twice.
 
     Raises ValueError as `check_scene` does, for voxels other than 8^3 and dtypes other than float32.
     """
     check(primitives, camera, span)
     tensors = [getattr(primitives, name) for name in BOX_FIELDS] + [camera.intrinsics, camera.world_to_camera]
     keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    with cuda_scene.on_device(primitives.position.device):
+    device = primitives.position.device
+    with cuda_scene.on_device(device):
+        repeats = cuda_graph.usable(device) and not cuda_graph.recording() and span is None and not keep
+        if repeats and primitives.position.shape[1] and (marcher := prepared(primitives, settings, shapes)):
+            return marcher(camera)
         return Rendering(*_March.apply(Scene(primitives, camera, settings, span, shapes, keep), *tensors))
 
 
@@ -58,21 +65,21 @@ class _March(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, scene: Scene, *tensors: Tensor) -> Picture:
         *geometry, rgb, density, intrinsics, world_to_camera = [tensor.detach().contiguous() for tensor in tensors]
-        if not rgb.shape[1]:
+        (p, k), (b, height, width) = rgb.shape[:2], (len(intrinsics), scene.camera.height, scene.camera.width)
+        if k == 0:
             check_scene(scene.primitives, scene.camera, scene.span)
-            nothing = intrinsics.new_zeros((len(intrinsics), scene.camera.height, scene.camera.width))
+            nothing = intrinsics.new_zeros((b, height, width))
             infinity = torch.full_like(nothing, torch.inf)
             ctx.units, ctx.nothing = None, [tensor.shape for tensor in tensors]
-            picture = (nothing[..., None].repeat(1, 1, 1, 3), nothing, infinity, infinity.clone())
+            picture = (nothing[..., None].expand(b, height, width, 3).clone(), nothing, infinity, infinity.clone())
             ctx.mark_non_differentiable(picture[3])
             return picture
-        packed = Packed.of(rgb, density)
+        packed = Packed.room(p, k, rgb.device).pack(rgb, density)
         placed = cuda_scene.place(scene, packed, geometry, intrinsics, world_to_camera)
-        totals = placed.totals.tolist()  # waits for the device
-        scene.check(totals)
-        plan = Plan.of(totals)
-        picture, kept = cuda_scene.draw(scene, packed, placed, plan)
-        ctx.units = plan.units
+        picture = cuda_scene.new_picture(b, height, width, rgb.device)
+        kept, ctx.units = cuda_scene.drawn(
+            scene, placed, lambda plan: cuda_scene.draw(scene, packed, placed, picture, plan)
+        )
         ctx.mark_non_differentiable(picture[3])
         ctx.shapes, ctx.spacing, ctx.index_order = scene.shapes, scene.spacing, scene.index_order
         if scene.keep:
@@ -100,7 +107,11 @@ def _adjoint(
     on_depth: Tensor,
     *saved: Tensor,
 ) -> tuple[Tensor | None, ...]:
-    """Gradients in the order of `_March.forward`'s tensors; those of the camera if they go `to_camera`."""
+    """Gradients in the order of `_March.forward`'s tensors; those of the camera if they go `to_camera`.
+
+    `units` may be more than the boxes have, in a recording; where they are too few, the result is of no use, as every
+    repetition of the recording looks for (see `cuda_scene.drawn`).
+    """
     position, rotation, half_extent, intrinsics, world_to_camera, record, indices, voxels, reach, kept, ends = saved
     height, width = on_alpha.shape[1:]
     (p, k), b, device = position.shape[:2], len(intrinsics), position.device
@@ -118,7 +129,8 @@ def _adjoint(
     units_of_box = (blocks + blocks_of_unit - 1) // blocks_of_unit
     unit_end = units_of_box.cumsum(0)
     unit = torch.arange(units, device=device)
-    unit_box = torch.searchsorted(unit_end, unit, right=True)
+    # Units behind the last one count as parts of the last box, behind its last block: they are empty.
+    unit_box = torch.searchsorted(unit_end, unit, right=True).clamp_max_(b * k - 1)
     unit_part = unit - (unit_end - units_of_box)[unit_box]
     unit_voxels, unit_sums = new((units, 64, 32)), new((units, triton_adjoint.SUMS))
     if units:
@@ -133,7 +145,7 @@ def _adjoint(
     launch(
         triton_adjoint.finish_boxes,
         (k, p),
-        unit_end,
+        unit_end.clamp_max_(units),
         unit_voxels,
         unit_sums,
         rotation,

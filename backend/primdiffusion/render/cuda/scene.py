@@ -1,7 +1,9 @@
 """What `march_cuda` draws, and how its kernels are launched: boxes packed and placed, listed by tile, marched (SPEC 4).
 
 The lengths of lists, the number of programs of the backward pass and the lattice points in use depend on the scene, and
-are known on the device alone: the host waits for them once, when the boxes are placed.
+are known on the device alone. The host does not wait for them: it launches everything by the `Plan` of the last such
+scene, and looks at the totals while the picture is being drawn. If the plan did not fit, the picture is drawn again
+before anybody has seen it, so that pictures and gradients depend on the scene alone and not on what was drawn before.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ import contextlib
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +21,7 @@ from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
+from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import triton_boxes, triton_lists, triton_march
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
@@ -27,8 +31,11 @@ LAST_POINT = (1 << 30) - 1
 """Lattice indices have 32 bits."""
 MOST_RANKED = 1 << 13
 """Boxes that are sorted by comparing all pairs, in one launch."""
-MULTIPLE = 16
-"""Lengths are multiples of it: Triton compiles anew for some that are not."""
+ROOM = 1.25
+"""Length of lists over what the scene needs, for the scenes after it."""
+MULTIPLE = 1024
+"""Lengths are multiples of it: Triton compiles anew for some that are not multiples of 16."""
+MOST_PLANS = 64
 LANES = 32
 """Boxes per program of `place_boxes` and `order_boxes`."""
 LANES_OF_ORDER = 256
@@ -38,6 +45,7 @@ LANES_OF_TILE = 64
 BOX_FIELDS = ("position", "rotation", "half_extent", "rgb", "density")
 Picture = tuple[Float[Tensor, "b h w 3"], Float[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]
 """rgb, alpha, depth, first hit."""
+Drawing = TypeVar("Drawing")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +103,12 @@ class Scene(NamedTuple):
         """The settings' strides in units."""
         return tuple(stride // self.unit for stride in self.settings.strides)
 
+    @property
+    def kind(self) -> tuple:
+        """Properties that scenes with a common plan share."""
+        position, size = self.primitives.position, (self.camera.width, self.camera.height)
+        return (*position.shape[:2], len(self.camera.intrinsics), *size, self.settings, self.shapes, position.device)
+
     def check(self, totals: list[int]) -> None:
         """Raise the ValueError of `check_scene` if the kernels found errors."""
         if totals[0] or totals[4]:
@@ -109,7 +123,7 @@ class Plan(NamedTuple):
     tiles: int
     """Entries of the lists of tiles; 0 if those of bins are used."""
     units: int
-    """Programs of the backward pass."""
+    """Programs of a backward pass that is recorded."""
     gap: int
     """The largest of 1, 2, 4 that divides the strides of all visible boxes."""
 
@@ -118,11 +132,22 @@ class Plan(NamedTuple):
         """The plan for a scene with these totals (see `triton_boxes`)."""
         _, bins, tiles, units, _, strides = totals
         gap = 1 if strides & 1 else 2 if strides & 2 else 4
-        return cls(_rounded(bins), 0 if tiles > LIST_LIMIT else _rounded(tiles), units, gap)
+        return cls(_with_room(bins), 0 if tiles > LIST_LIMIT else _with_room(tiles), _with_room(units), gap)
+
+    def fits(self, totals: list[int]) -> bool:
+        """Whether a scene with these totals is drawn by this plan as by its own."""
+        own = Plan.of(totals)
+        same = (self.gap, self.tiles == 0) == (own.gap, own.tiles == 0)
+        enough = totals[1] <= self.bins and (not self.tiles or totals[2] <= self.tiles) and totals[3] <= self.units
+        return same and enough and not (totals[0] or totals[4])
 
 
-def _rounded(entries: int) -> int:
-    return max(-(-entries // MULTIPLE), 1) * MULTIPLE
+_plans: dict[tuple, Plan] = {}
+"""The plan of the last scene of each kind."""
+
+
+def _with_room(entries: int) -> int:
+    return max(-(-int(entries * ROOM) // MULTIPLE), 1) * MULTIPLE
 
 
 class Packed(NamedTuple):
@@ -132,13 +157,15 @@ class Packed(NamedTuple):
     bounds: Int[Tensor, "p k 8"]
 
     @classmethod
-    def of(cls, rgb: Tensor, density: Tensor) -> Packed:
-        """Pack these contents."""
-        people, boxes = rgb.shape[:2]
-        bounds = torch.empty((people, boxes, 8), dtype=torch.int32, device=rgb.device)
-        packed = cls(torch.empty((people, boxes, 512, 4), device=rgb.device), bounds)
-        launch(triton_boxes.pack_boxes, (people * boxes,), rgb, density, *packed, num_warps=4)
-        return packed
+    def room(cls, people: int, boxes: int, device: torch.device) -> Packed:
+        """Uninitialised memory."""
+        bounds = torch.empty((people, boxes, 8), dtype=torch.int32, device=device)
+        return cls(torch.empty((people, boxes, 512, 4), device=device), bounds)
+
+    def pack(self, rgb: Tensor, density: Tensor) -> Packed:
+        """Fill with these contents, and return self."""
+        launch(triton_boxes.pack_boxes, (self.bounds[..., 0].numel(),), rgb, density, *self, num_warps=4)
+        return self
 
 
 class Placed(NamedTuple):
@@ -203,7 +230,7 @@ def check(primitives: Primitives, camera: Camera, span: Span | None) -> None:
 
 @functools.cache
 def _lattice(spacing: float, thresholds: tuple[float, ...], device: torch.device) -> Tensor:
-    """The argument `lattice` of `place_boxes`, kept because copying it synchronises."""
+    """The argument `lattice` of `place_boxes`: copying it synchronises. Kept for good, because graphs read it."""
     return torch.tensor([spacing, *thresholds], dtype=torch.float64, device=device)
 
 
@@ -237,18 +264,45 @@ def place(scene: Scene, packed: Packed, geometry: list[Tensor], intrinsics: Tens
     return Placed(record, indices, order, reach, totals)
 
 
+def drawn(scene: Scene, placed: Placed, draw: Callable[[Plan], Drawing]) -> tuple[Drawing, int]:
+    """Draw by the plan of the last such scene, again if it does not fit; also the programs of the backward pass.
+
+    The host waits for the totals while the picture is being drawn. In a recording it cannot: then each repetition
+    looks at them, and this is drawn again from Python if they do not fit.
+    """
+    plan, kind = _plans.get(scene.kind), scene.kind
+    if plan is not None and cuda_graph.recording():
+        cuda_graph.expect(placed.totals, plan.fits)
+        return draw(plan), plan.units
+    reading = cuda_graph.Reading(placed.totals)
+    drawing = None if plan is None else draw(plan)
+    totals = reading.wait()
+    scene.check(totals)
+    if plan is None or drawing is None or not plan.fits(totals):
+        _plans.pop(kind, None)
+        if len(_plans) >= MOST_PLANS:
+            _plans.pop(next(iter(_plans)))
+        plan = _plans[kind] = Plan.of(totals)
+        drawing = draw(plan)
+    return drawing, totals[3]
+
+
+def new_picture(b: int, height: int, width: int, device: torch.device) -> Picture:
+    """Uninitialised memory for a picture."""
+    flat, new = (b, height, width), functools.partial(torch.empty, device=device)
+    return new((*flat, 3)), new(flat), new(flat), new(flat)
+
+
 def march_constants(shapes: Shapes, sets: int, gap: int) -> dict[str, int]:
     """Compile-time constants of `march_tiles`: `sets` of lattice points, `gap` apart."""
     coarse = shapes.samples // (2 if sets == 4 else 1)
     return {"TILE_WIDTH": shapes.tile[0], "TILE_HEIGHT": shapes.tile[1], "COARSE": coarse, "SETS": sets, "GAP": gap}
 
 
-def draw(scene: Scene, packed: Packed, placed: Placed, plan: Plan) -> tuple[Picture, Kept]:
-    """List the boxes by tile, and march."""
-    shapes, height, width, device = scene.shapes, scene.camera.height, scene.camera.width, placed.record.device
-    (p, k), b, keep = packed.bounds.shape[:2], len(placed.record), scene.keep or scene.index_order
-    rgb = torch.empty((b, height, width, 3), device=device)
-    alpha, depth, first_hit = (torch.empty((b, height, width), device=device) for _ in range(3))
+def draw(scene: Scene, packed: Packed, placed: Placed, picture: Picture, plan: Plan) -> Kept:
+    """List the boxes by tile and march; writes `picture`."""
+    shapes, (b, height, width), device = scene.shapes, picture[1].shape, picture[1].device
+    (p, k), keep = packed.bounds.shape[:2], scene.keep or scene.index_order
     kept = torch.empty((b, height, width, 8) if keep else 0, device=device)
     ends = torch.empty((b, height, width, 2) if keep else 0, dtype=torch.int32, device=device)
     fine = math.gcd(max(scene.strides), 4)
@@ -259,7 +313,7 @@ def draw(scene: Scene, packed: Packed, placed: Placed, plan: Plan) -> tuple[Pict
     list_across = -(-across // tiles_of_list)
     sizes = (k, k if p == b else 0, height, width, across, list_across, lists[1].shape[1], scene.spacing)
     launch(triton_march.march_tiles, (across * down, b), 
-        *boxes, *lists, placed.reach, rgb, alpha, depth, first_hit, kept, ends, *sizes,
+        *boxes, *lists, placed.reach, *picture, kept, ends, *sizes,
         TILES_OF_LIST=tiles_of_list, HAS_SPAN=placed.reach is not None, KEEP=keep,
         WHOLE=all(fine % stride == 0 for stride in scene.strides), INDEX_ORDER=scene.index_order,
         **march_constants(shapes, fine // gap, gap), num_warps=shapes.march_warps, maxnreg=shapes.march_registers,
@@ -267,14 +321,14 @@ def draw(scene: Scene, packed: Packed, placed: Placed, plan: Plan) -> tuple[Pict
     if scene.index_order:
         by_index = torch.arange(k, dtype=torch.int32, device=device).repeat(b, 1)
         launch(triton_march.end_in_order, (across * down, b), 
-            *boxes, *_list(scene, plan, placed, by_index)[:3], rgb, kept, ends, *sizes,
+            *boxes, *_list(scene, plan, placed, by_index)[:3], picture[0], kept, ends, *sizes,
             TILES_OF_LIST=tiles_of_list, TILE_WIDTH=shapes.tile[0], TILE_HEIGHT=shapes.tile[1], num_warps=1,
         )  # fmt: skip
-    return (rgb, alpha, depth, first_hit), Kept(kept, ends)
+    return Kept(kept, ends)
 
 
 def _list(scene: Scene, plan: Plan, placed: Placed, order: Int[Tensor, "b k"]) -> _Lists:
-    """List the boxes of each tile, or bin, in `order`."""
+    """List the boxes of each tile, or bin, in `order`; a list may be cut short where the plan does not fit."""
     (b, k), device = order.shape, order.device
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     across, down = -(-width // shapes.tile[0]), -(-height // shapes.tile[1])
