@@ -23,7 +23,7 @@ from primdiffusion.encoder.model import load_encoder, save_encoder
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary
 from primdiffusion.training.fit import EncoderTask
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.loop import begin_phase, take_step
+from primdiffusion.training.loop import begin_training, take_step
 from primdiffusion.training.state import TrainingState, accelerator_of
 from record import command_line, report
 
@@ -116,10 +116,10 @@ class Taken(NamedTuple):
 def timed_steps(config: FitConfig, captures: Captures) -> Iterator[Taken]:
     """The steps of `primdiffusion fit`, and the processor's seconds of each."""
     task = EncoderTask(config, captures, accelerator_of())
-    state = begin_phase(task, "", task.accelerator)
+    state = begin_training(task, task.accelerator)
     began = time.process_time()
     while state.step < config.steps:
-        progress = take_step(task, "", config.seed, state)
+        progress = take_step(task, config.seed, state)
         yield Taken(task, state, time.process_time() - began, sum(progress.terms.values()))
         began = time.process_time()
 

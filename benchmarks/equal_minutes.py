@@ -32,7 +32,7 @@ from primdiffusion.training.cells import PREPARED
 from record import command_line, report
 
 LEVELS = ("50", "100", "300", "500")
-WIDE = ("model.local:local-u-net-config", "--model.local.widths", "256", "320", "384")
+WIDE = ("--model.widths", "256", "320", "384")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
     "adamw": ("--local.optimiser", "adamw"),
@@ -41,7 +41,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "uniform": ("--local.levels", "uniform"),
     "wide": WIDE,
 }
-UNTRAINED = ("--person.steps", "1", "--local.evaluate-every", "1000000", "--pictures-every", "1000000")
+UNMEASURED = ("--local.evaluate-every", "1000000", "--pictures-every", "1000000")
 
 
 def main() -> None:
@@ -73,7 +73,7 @@ def train(data: Path, run: Path, minutes: float, *options: str) -> None:
     """Train on one core for so much processor time; 0 prepares and stops. Raises CalledProcessError."""
     limit = ("--minutes", "0") if not minutes else ()
     command = [sys.executable, "-m", "primdiffusion", "train", "--data", str(data), "--run", str(run),
-               "--threads", "1", *limit, *UNTRAINED, *options]  # fmt: skip
+               "--threads", "1", *limit, *UNMEASURED, *options]  # fmt: skip
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
         while minutes and child.poll() is None and processor_seconds(child.pid) < 60 * minutes:
             time.sleep(1)

@@ -20,7 +20,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.human import Human, people_of
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import blends, mixed, weighted_error
 from torch import Tensor
@@ -47,7 +47,7 @@ class DecoderObjective:
     denoiser: PersonDenoiser
     people: LatentSet
     codec: LinearCodec
-    config: PhaseConfig
+    config: NetworkTraining
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted error of a random batch."""

@@ -36,9 +36,11 @@ from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu.march import count_samples
+from primdiffusion.render.cuda import available
 from primdiffusion.render.cuda import graph as cuda_graph
-from primdiffusion.render.cuda.march import Shapes, available, march_cuda
+from primdiffusion.render.cuda.march import march_cuda
 from primdiffusion.render.cuda.marcher import Marcher
+from primdiffusion.render.cuda.scene import Shapes
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings
 from primdiffusion.render.reference import march_reference

@@ -2,13 +2,13 @@
 
 `python benchmarks/train_baselines.py primitives --model ours --people DIR --out DIR --minutes 12`, and the same with
 `--model latents`, prepare codec, latents and prior as `primdiffusion train` does with its default settings, and train
-the person network for a fifth of the time and the U-Net for the rest. What is prepared does not count, and can be
-shared by both (--prepared). DIR/model.safetensors states the minutes.
+the U-Net. What is prepared does not count, and can be shared by both (--prepared). DIR/model.safetensors states the
+minutes.
 
 `python benchmarks/train_baselines.py voxels --people DIR --out DIR --minutes 45` makes the grids of the people that
 `primdiffusion train` trains on (with its holdout and seed) into DIR/grids, fits codec and closed-form prior, and trains
-both networks likewise. DIR/voxel.safetensors, which is what diffusion.py takes, is there from the first minute of the
-U-Net and states how long it was trained.
+the U-Net likewise. DIR/voxel.safetensors, which is what diffusion.py takes, is there from the first minute and states
+how long it was trained.
 
 Minutes are the processor's while it trains; what is made before does not count. The same command continues where it
 stopped.
@@ -21,7 +21,7 @@ import dataclasses
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -38,10 +38,10 @@ from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
 from primdiffusion.training.cells import CellTask, prepare
-from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
+from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
 from primdiffusion.training.loop import step_seed
-from primdiffusion.training.losses import PersonObjective, RestObjective
+from primdiffusion.training.losses import RestObjective
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.state import TrainingState, accelerator_of
 from safetensors.torch import load_file, save
@@ -56,16 +56,13 @@ from voxel_baseline import (
     voxelise,
 )
 
-PERSON_SHARE = 0.2
-"""Share of the time that the network over person components gets; the other one gets the rest."""
 SAVE_EVERY = 60.0
 TRIED = 7
 """Steps that are timed to plan the others; the first two are warm-up."""
 CHANNELS = 64
 """Numbers of a cell, as many as a primitive has in our codec."""
-PERSON = PhaseConfig(steps=1, batch=256)
-LOCAL = PhaseConfig(steps=1, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True)
-"""The default model's phases; steps follow from the time."""
+LOCAL = NetworkTraining(steps=1, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True)
+"""Training of the default model; steps follow from the time."""
 
 
 class Objective(Protocol):
@@ -76,57 +73,60 @@ class Objective(Protocol):
         ...
 
 
-Objectives = Callable[[str, PhaseConfig], Objective]
-"""The objective of a network ("person", "local") with these settings."""
-
-
 class Run(NamedTuple):
-    """What the networks of a denoiser are trained with."""
+    """What the U-Net of a denoiser is trained with."""
 
-    objectives: Objectives
-    phases: Mapping[str, PhaseConfig]
-    """Settings of each network; their steps follow from the time."""
+    denoiser: PersonDenoiser
+    objective: Objective
+    config: NetworkTraining
+    """Settings of the training; steps follow from the time."""
+    people: LatentSet
     folder: Path
     seed: int
+    threads: int
 
 
-class Progress(NamedTuple):
-    """How long a network was trained."""
-
-    steps: int
-    seconds: float
+Save = Callable[[dict[str, object]], None]
+"""Called at intervals, while the average of the weights is in place, with what the model's card says."""
 
 
-Export = Callable[[str, torch.nn.Module, Progress], None]
-"""Called at intervals with the name of a network, the average of its weights, and its progress."""
-
-
-def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export: Export) -> None:
-    """Trains one network for so many seconds, interruptions not counted, and leaves its average in place.
+def train(run: Run, minutes: float, save: Save) -> None:
+    """Train for so many minutes, interruptions not counted, and leave the average of the weights in place.
 
     The rate falls over the planned steps; further ones have its last value.
     """
-    network = getattr(denoiser, name).requires_grad_(True)
-    plan, stored = run.folder / f"{name}.json", run.folder / f"{name}.state.safetensors"
+    denoiser, seconds = run.denoiser, 60 * minutes
+    network = _network(denoiser).requires_grad_(True)
+    plan, stored = run.folder / "local.json", run.folder / "local.state.safetensors"
     if not plan.is_file():
-        plan.write_text(json.dumps(planned_steps(denoiser, name, run, seconds)), encoding="utf-8")
-    config = dataclasses.replace(run.phases[name], steps=json.loads(plan.read_text(encoding="utf-8")))
+        plan.write_text(json.dumps(planned_steps(run, seconds)), encoding="utf-8")
+    config = dataclasses.replace(run.config, steps=json.loads(plan.read_text(encoding="utf-8")))
     state = TrainingState(network, config, accelerator_of())
     if stored.is_file():
         state.load(stored)
-    objective = run.objectives(name, config)
     denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
     network.train()
     mean, saved = 0.0, time.monotonic()
 
     def save_all() -> None:
         state.save(stored)
-        print(name, state.step, "of", config.steps, f"{state.seconds:.0f} s, loss {mean:.4f}", flush=True)
-        export(name, state.average, Progress(state.step, state.seconds))
+        print(state.step, "of", config.steps, f"{state.seconds:.0f} s, loss {mean:.4f}", flush=True)
+        denoiser.local = state.average  # pyright: ignore[reportAttributeAccessIssue]
+        about = {
+            "people": len(run.people),
+            "geometries": len(run.people.betas),
+            "minutes": round(state.seconds / 60, 1),
+            "threads": run.threads,
+            "steps": {"local": state.step},
+            "batch": {"local": config.batch},
+        }
+        save(about)
+        denoiser.local = network  # pyright: ignore[reportAttributeAccessIssue]
+        print(json.dumps(about), flush=True)
 
     while state.seconds < seconds:
         began = time.process_time()
-        loss = objective.loss(numbers(run.seed + 1, name, state.step))
+        loss = run.objective.loss(numbers(run.seed + 1, state.step))
         state.update(loss)
         mean += (float(loss.detach()) - mean) / min(state.step, 200)
         state.seconds += time.process_time() - began
@@ -134,63 +134,35 @@ def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export:
             saved = time.monotonic()
             save_all()
     save_all()
-    setattr(denoiser, name, state.average)
+    denoiser.local = state.average  # pyright: ignore[reportAttributeAccessIssue]
     denoiser.network_dtype = torch.float32
 
 
-def numbers(seed: int, name: str, step: int) -> torch.Generator:
+def numbers(seed: int, step: int) -> torch.Generator:
     """The random numbers of a step: a run that goes on draws those that it would have drawn."""
-    seed = step_seed(seed, name, step, 0)
+    seed = step_seed(seed, "local", step, 0)
     torch.manual_seed(seed)
     return torch.Generator().manual_seed(seed)
 
 
-def planned_steps(denoiser: PersonDenoiser, name: str, run: Run, seconds: float) -> int:
+def planned_steps(run: Run, seconds: float) -> int:
     """How many steps fit into the time, by a few of a network that is thrown away: the rate falls over as many."""
-    config = dataclasses.replace(run.phases[name], steps=1000)
-    network = getattr(denoiser, name)
+    config, network = dataclasses.replace(run.config, steps=1000), _network(run.denoiser)
     weights = {key: value.clone() for key, value in network.state_dict().items()}
     state = TrainingState(network, config, accelerator_of())
-    objective = run.objectives(name, config)
-    denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
+    run.denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
     times = []
     for _ in range(TRIED):
         began = time.process_time()
-        state.update(objective.loss(numbers(run.seed, name, state.step)))
+        state.update(run.objective.loss(numbers(run.seed, state.step)))
         times.append(time.process_time() - began)
     network.load_state_dict(weights)
     return max(1, round(seconds / statistics.median(times[2:])))
 
 
-def train_both(
-    denoiser: PersonDenoiser,
-    run: Run,
-    people: LatentSet,
-    minutes: float,
-    threads: int,
-    save: Callable[[dict[str, object]], None],
-) -> None:
-    """Trains the person network, then the U-Net; `save` is called at intervals with what the model's card says."""
-    done: dict[str, Progress] = {}
-
-    def export(name: str, network: torch.nn.Module, progress: Progress) -> None:
-        done[name] = progress
-        trained_one = getattr(denoiser, name)
-        setattr(denoiser, name, network)
-        about = {
-            "people": len(people),
-            "geometries": len(people.betas),
-            "minutes": round(sum(part.seconds for part in done.values()) / 60, 1),
-            "threads": threads,
-            "steps": {part: progress.steps for part, progress in done.items()},
-            "batch": {part: phase.batch for part, phase in run.phases.items()},
-        }
-        save(about)
-        setattr(denoiser, name, trained_one)
-        print(json.dumps(about), flush=True)
-
-    train(denoiser, "person", run, 60 * minutes * PERSON_SHARE, export)
-    train(denoiser, "local", run, 60 * minutes * (1 - PERSON_SHARE), export)
+def _network(denoiser: PersonDenoiser) -> torch.nn.Module:
+    assert denoiser.local is not None
+    return denoiser.local
 
 
 def parser_of(description: str) -> argparse.ArgumentParser:
@@ -222,24 +194,22 @@ def primitives() -> None:
 
 
 def train_model(config: TrainingConfig, kind: str, out: Path, minutes: float, threads: int) -> None:
-    """Trains both networks of a model; the prepared parts are those of `config.run`."""
+    """Trains the network of a model; the prepared parts are those of `config.run`."""
     people = PersonFolder(config.data)
     prepared = prepare(config, people, *split_people(range(len(people.names)), config.holdout, config.seed))
     task = CellTask(config, prepared, torch.device("cpu"))
     denoiser = task.denoiser
 
-    def objective(name: str, phase: PhaseConfig) -> Objective:
-        if name == "local" and kind == "latents":
-            return DecoderObjective(denoiser, prepared.train, prepared.codec, phase)
-        return task.objective(name)
+    objective: Objective = task.objective
+    if kind == "latents":
+        objective = DecoderObjective(denoiser, prepared.train, prepared.codec, task.settings)
 
     def save(about: dict[str, object]) -> None:
         named = {"name": f"{kind}, of a comparison on equal time", "baseline": kind}
         card = {**named, "full_density": prepared.full_density, **about}
         save_checkpoint(out / "model.safetensors", dataclasses.replace(task.model(), card=card), str(config.schedule))
 
-    run = Run(objective, task.phases, out, config.seed)
-    train_both(denoiser, run, prepared.train, minutes, threads, save)
+    train(Run(denoiser, objective, task.settings, prepared.train, out, config.seed, threads), minutes, save)
 
 
 def voxels() -> None:
@@ -257,16 +227,16 @@ def voxels() -> None:
     codec, people, prior = prepared(train_paths, vocabulary, arguments.out)
     torch.manual_seed(arguments.seed)
     denoiser, shapes = voxel_denoiser(prior, codec), fit_shapes(people, prior)
-    objectives = objective_of(denoiser, people, codec, vocabulary)
-    phases = {"person": PERSON, "local": dataclasses.replace(LOCAL, batch=arguments.batch)}
-    run = Run(objectives, phases, arguments.out, arguments.seed)
+    settings = dataclasses.replace(LOCAL, batch=arguments.batch)
+    objective = RestObjective(denoiser, people, codec, vocabulary, settings)  # pyright: ignore[reportArgumentType]
     full_density = read_person(train_paths[0]).full_density
 
     def save(about: dict[str, object]) -> None:
         model = VoxelModel(denoiser, codec, shapes, full_density, {**about, "schedule": SCHEDULE})
         save_voxel_model(arguments.out / "voxel.safetensors", model)
 
-    train_both(denoiser, run, people, arguments.minutes, arguments.threads, save)
+    run = Run(denoiser, objective, settings, people, arguments.out, arguments.seed, arguments.threads)
+    train(run, arguments.minutes, save)
 
 
 def make_grids(paths: Sequence[Path], folder: Path) -> None:
@@ -331,22 +301,6 @@ def encoded(
     geometry = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(one) for one in latents]))
     detailed = torch.tensor(len(conditions))
     return LatentSet(torch.cat(latents), geometry, torch.stack(betas), torch.stack(conditions), detailed)
-
-
-def objective_of(
-    denoiser: PersonDenoiser, people: LatentSet, codec: VoxelCodec, vocabulary: AttributeVocabulary
-) -> Objectives:
-    """The losses that our model is trained by."""
-
-    def of(name: str, config: PhaseConfig) -> PersonObjective | RestObjective:
-        if name == "local":
-            return RestObjective(denoiser, people, codec, vocabulary, config)  # pyright: ignore[reportArgumentType]
-        coefficients = torch.cat([denoiser.prior.split(chunk.float())[0] for chunk in people.latents.split(128)])
-        # As in `training.cells`: components vary more over the people they are fitted to than over new ones.
-        coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
-        return PersonObjective(denoiser, coefficients, people, vocabulary, config)
-
-    return of
 
 
 if __name__ == "__main__":

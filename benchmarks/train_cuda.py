@@ -31,7 +31,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import CellCodec
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.render.cuda import graph as cuda_graph
-from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.config import NetworkTraining, TrainingConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import RestObjective
 from primdiffusion.training.muon import MuonAdamW
@@ -42,7 +42,7 @@ PEOPLE, BATCHES, STEPS = 64, (16, 64), 10
 
 
 class Training:
-    """The local network in training, as at the start of its phase."""
+    """The local network in training, as at the start of a run."""
 
     def __init__(self, batch: int, people: int = PEOPLE) -> None:
         accelerator = accelerator_of()
@@ -57,7 +57,7 @@ class Training:
         ).to(device)
         denoiser.float().eval().requires_grad_(False).to(device)
         settings = TrainingConfig.__dataclass_fields__["local"].default_factory()
-        assert isinstance(settings, PhaseConfig)
+        assert isinstance(settings, NetworkTraining)
         settings = dataclasses.replace(settings, batch=batch)
         assert denoiser.local is not None
         network = denoiser.local.requires_grad_(True)

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from primdiffusion.diffusion.codec import DEAD_ZONE, SLAB_UNIT
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser, PersonNetworkConfig
+from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
@@ -379,11 +379,10 @@ class VoxelModel:
 
 
 def voxel_denoiser(
-    prior: PersonPrior, codec: VoxelCodec, config: VoxelUNetConfig = VoxelUNetConfig(), blocks: int = 3
+    prior: PersonPrior, codec: VoxelCodec, config: VoxelUNetConfig = VoxelUNetConfig()
 ) -> PersonDenoiser:
     """Build an untrained denoiser: the default model's with a 3D U-Net for the cells."""
-    person = PersonNetworkConfig(blocks=blocks)
-    denoiser = PersonDenoiser(DenoiserConfig(person=person, local=None), prior, SCHEDULES[SCHEDULE]())
+    denoiser = PersonDenoiser(None, prior, SCHEDULES[SCHEDULE]())
     denoiser.local = VoxelUNet(len(codec.basis), len(prior.parity), codec.cells, config)
     return denoiser.eval().requires_grad_(False)
 

@@ -4,8 +4,8 @@
     primdiffusion train --start-from start.safetensors --data people --run runs/next
 
 People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
-for the closed form alone. The network over person components goes: its components are others now. The local network
-keeps its weights for what has not changed. With `--surfaces-only` everything stays but the surfaces of one colour.
+for the closed form alone. The network keeps its weights for what has not changed. With `--surfaces-only` everything
+stays but the surfaces of one colour.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def joined(latents: LatentSet, more: LatentSet, used: Tensor) -> LatentSet:
 
 def with_prior(base: PersonDenoiser, prior: PersonPrior) -> PersonDenoiser:
     """A denoiser of another prior with the local network of `base`, which forgets attributes and person components."""
-    denoiser = PersonDenoiser(dataclasses.replace(base.config, person=None), prior, base.schedule)
+    denoiser = PersonDenoiser(base.config, prior, base.schedule)
     assert base.local is not None
     assert denoiser.local is not None
     weights = denoiser.local.state_dict()

@@ -10,14 +10,13 @@ from accelerate.state import AcceleratorState
 from diffusion_people import SMALL
 from primdiffusion.diffusion.unet import UNetConfig
 from primdiffusion.training import diffusion_task, losses
-from primdiffusion.training.config import CodecConfig, PhaseConfig, PriorConfig, TrainingConfig
+from primdiffusion.training.config import CodecConfig, NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import train
 from support.runs import rows
 
 TINY_UNET = UNetConfig(width=32, multipliers=(1, 1, 1, 1, 1), blocks=1, heads=2)
 DEFAULT_FILES = {".lock", "config.json", "run.json", "metrics.jsonl", "pictures", "model.safetensors",
-                 "prepared.safetensors",
-                 "person.state.safetensors", "local.state.safetensors"}  # fmt: skip
+                 "prepared.safetensors", "state.safetensors"}  # fmt: skip
 
 
 def make_small(patch: pytest.MonkeyPatch) -> None:
@@ -31,29 +30,27 @@ def make_small(patch: pytest.MonkeyPatch) -> None:
 
 
 def settings(people: Path, run: Path, **changes) -> TrainingConfig:
-    """Six steps of the person network and four of the local one, or two of the paper's."""
+    """Ten steps, or two of the paper's preset."""
     quick = {
         "holdout": 0.2,
         "codec": CodecConfig(channels=4, people=8),
         "prior": PriorConfig(components=6),
         "model": SMALL,
-        "person": PhaseConfig(steps=6, batch=16, evaluate_every=6),
-        "local": PhaseConfig(steps=4, batch=4, evaluate_every=4),
+        "local": NetworkTraining(steps=10, batch=4, evaluate_every=5),
         "unet": TINY_UNET,
-        "slab": PhaseConfig(steps=2, batch=1, learning_rate=1e-3, evaluate_every=2),
+        "slab": NetworkTraining(steps=2, batch=1, learning_rate=1e-3, evaluate_every=2),
         "log_every": 1,
         "threads": 1,
     }
     return TrainingConfig(data=people, run=run, **{**quick, **changes})
 
 
-def logged(run: Path) -> list[tuple[str, int]]:
-    """Phases and steps of the lines that tell the loss."""
-    return [(row["phase"], row["step"]) for row in rows(run) if "loss" in row]
+def logged(run: Path) -> list[int]:
+    """Steps of the lines that tell the loss."""
+    return [row["step"] for row in rows(run) if "loss" in row]
 
 
 if __name__ == "__main__":  # a run in a process of its own
     make_small(pytest.MonkeyPatch())
-    data, folder, person, local = sys.argv[1:]
-    phases = {"person": PhaseConfig(**json.loads(person)), "local": PhaseConfig(**json.loads(local))}
-    train(settings(Path(data), Path(folder), **phases))
+    data, folder, local = sys.argv[1:]
+    train(settings(Path(data), Path(folder), local=NetworkTraining(**json.loads(local))))

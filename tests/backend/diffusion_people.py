@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser, PersonNetworkConfig
+from primdiffusion.diffusion.denoiser import LocalUNetConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import linear
@@ -17,10 +17,7 @@ from support.priors import of_whole_body
 
 CHANNELS, COMPONENTS = 4, 6
 VOCABULARY = AttributeVocabulary({"outfit": ("jeans", "suit")}, {})
-SMALL = DenoiserConfig(
-    PersonNetworkConfig(width=16, blocks=1),
-    LocalUNetConfig(widths=(8, 8), position_channels=2, condition_width=8, heads=2),
-)
+SMALL = LocalUNetConfig(widths=(8, 8), position_channels=2, condition_width=8, heads=2)
 
 
 def random_prior(
@@ -89,15 +86,13 @@ def prior_of_parts(seed: int, asked: int = 0) -> PersonPrior:
 
 
 def small_model(seed: int = 0, scale: float = 3.0) -> DiffusionModel:
-    """A model of the default architecture with few channels; its networks' outputs are made to differ from 0."""
+    """A model of the default architecture with few channels; its network's output is made to differ from 0."""
     asked = VOCABULARY.width
     prior = random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed, asked=asked).to(dtype=torch.float32)
     prior = dataclasses.replace(prior, centre=prior.centre * scale, variance=prior.variance * scale**2)
     torch.manual_seed(seed)
     denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
-    torch.nn.init.normal_(denoiser.person.outer.weight, std=0.1)
     torch.nn.init.normal_(denoiser.local.outer.weight, std=0.1)
-    torch.nn.init.normal_(denoiser.person.asked.weight)
     basis = torch.linalg.qr(torch.randn(VALUES, CHANNELS))[0].T.contiguous()
     basis[:, -3:] = 0.0
     basis = torch.linalg.qr(basis.T)[0].T.contiguous()

@@ -72,7 +72,7 @@ def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, 
         assert Path(result[name]).stat().st_size > 0
     assert result["steps"] == 3
     assert result.get("seed") == EDITS[method].get("seed")
-    assert result["seconds"] >= result["seconds_sampling"] > 0
+    assert result["seconds"] > 0
     edits = load_human(result["person"]).provenance["edits"]
     assert edits[0]["edit"].startswith(method)
     assert not list(Path(asked["out_dir"]).glob(".*"))

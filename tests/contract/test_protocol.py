@@ -62,8 +62,7 @@ def test_generate_reports_every_step_and_leaves_whole_files(child, checkpoint, t
     assert steps[-1][2] == 0
     assert all(eta is not None for _, _, eta in steps[3:])
     assert (result["seed"], result["steps"]) == (5, 6)
-    assert 0 < result["seconds_sampling"] < result["seconds"]
-    assert result["peak_gb"] > 0.1
+    assert result["seconds"] > 0
     assert sorted(path.name for path in out.iterdir()) == [
         "depth.png", "front.png", "person.human.safetensors", "side.png",
     ]  # fmt: skip

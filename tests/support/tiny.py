@@ -11,7 +11,7 @@ import torch
 from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser
+from primdiffusion.diffusion.denoiser import LocalUNetConfig, PersonDenoiser
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES, linear
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
@@ -57,7 +57,7 @@ def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
         kind=torch.nn.functional.pad(torch.eye(2), (0, VOCABULARY.width - 2))[None],
     )
     schedule = SCHEDULES["linear"]()
-    denoiser = PersonDenoiser(DenoiserConfig(person=None, local=local), prior, schedule)
+    denoiser = PersonDenoiser(local, prior, schedule)
     card = {"name": "tiny", "full_density": FULL_DENSITY}
     return DiffusionModel(denoiser, schedule, CellCodec(codec), STANDARD_SHAPES, FULL_DENSITY, card, VOCABULARY)
 
@@ -72,7 +72,7 @@ def model_of_two_kinds() -> DiffusionModel:
         variance=torch.ones(1, COMPONENTS),
         kind=torch.tensor([[[1.0, 0, 1, 0], [0, 1, 0, 1]]]),
     )
-    denoiser = PersonDenoiser(DenoiserConfig(person=None, local=None), prior, tiny.schedule)
+    denoiser = PersonDenoiser(None, prior, tiny.schedule)
     vocabulary = AttributeVocabulary({"sex": ("female", "male"), "outfit": ("jeans", "suit")}, {})
     return dataclasses.replace(tiny, denoiser=denoiser, vocabulary=vocabulary)
 

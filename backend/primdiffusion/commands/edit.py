@@ -33,7 +33,6 @@ from primdiffusion.formats.requests import (
 )
 from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
-from primdiffusion.runtime.machine import peak_memory_gb
 
 Sampling = Callable[[Decode], AbstractContextManager[OnStep]]
 """Reports the steps of a sampler, with previews of the humans that the function makes of its x0 guesses."""
@@ -55,7 +54,6 @@ def edit(request: EditRequest, session: Session, report: ReportProgress) -> Huma
                 yield step_reporter(report, preview)
 
         human = _EDITS[type(request)](request, load_human(request.person), session, sampling)
-        edited = time.perf_counter()
         report("write", steps, steps, None)
         drawn = not skips_previews(request.picture_px)
         write_human(folder, human, request.size, previews=drawn)
@@ -67,8 +65,6 @@ def edit(request: EditRequest, session: Session, report: ReportProgress) -> Huma
         steps=steps,
         edit=human.provenance["edits"][-1]["edit"],
         seconds=round(time.perf_counter() - began, 3),
-        seconds_sampling=round(edited - began, 3),
-        peak_gb=round(peak_memory_gb(), 3),
     )
 
 

@@ -35,7 +35,6 @@ from primdiffusion.formats.answers import HumanAnswer, VariationsAnswer
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
 from primdiffusion.human import Human, generate_batch, people_of
 from primdiffusion.human_file import load_human
-from primdiffusion.runtime.machine import peak_memory_gb
 
 
 def generate(request: GenerateRequest, session: Session, report: ReportProgress) -> HumanAnswer:
@@ -84,7 +83,6 @@ def _generate_batch(
                 request.guidance,
                 RELEASED_END if released else CLEAN,
             )
-        sampled = time.perf_counter()
         report("write", steps, steps, None)
         drawn = not skips_previews(request.picture_px)
         looks = {"compact": request.compact, "compositing": request.compositing, "previews": drawn}
@@ -99,8 +97,6 @@ def _generate_batch(
             seed=seed,
             steps=steps,
             seconds=round(seconds, 3),
-            seconds_sampling=round((sampled - began) / len(seeds), 3),
-            peak_gb=round(peak_memory_gb(), 3),
         )
         for seed, folder, human in zip(seeds, folders, humans, strict=True)
     ]
@@ -129,7 +125,6 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
         people=[variation_files(request.out_dir, seed) for seed in request.seeds],
         warnings=warnings,
         seconds=round(time.perf_counter() - began, 3),
-        peak_gb=round(peak_memory_gb(), 3),
     )
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from primdiffusion.formats.requests import (
     VOXEL,
     Count,
+    EncodeSettings,
     GaussiansRequest,
     GenerateRequest,
     InpaintRequest,
@@ -26,7 +27,7 @@ from primdiffusion.formats.requests import (
     VaryRequest,
     Voxel,
 )
-from primdiffusion.formats.schema import Ending, FieldError, Option, Range
+from primdiffusion.formats.schema import Ending, FieldError, Option
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,7 +131,7 @@ class PayloadsCommand(MadePeople):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EncodePayloadsCommand:
+class EncodePayloadsCommand(EncodeSettings):
     """Encode captures as training payloads with the trained encoder.
 
     Captures are those of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's
@@ -145,17 +146,6 @@ class EncodePayloadsCommand:
     """Trained encoder (.safetensors); the default is the one in the package."""
     people: Path | None = None
     """Folder of `primdiffusion people` that was captured, for attributes such as outfit, hair and height."""
-    views: Count = 8
-    """Images to encode, spread around the subject; all if there are fewer."""
-    looks: Count = 1
-    """Frames of each subject to encode, evenly spaced; the first, near the T pose, has the least occlusion."""
-    refine_steps: Annotated[int, Range(0)] = 0
-    """Refinement steps on all images of the subject, which restore detail that the encoder blurs, such as 300; 0 for
-    none."""
-    refine_size: Pixels = 256
-    """Largest side of the images used in refinement, pixels."""
-    seed: Seed = 0
-    """Seed of the order of images in refinement."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.runtime.worker_process import lock_folder
-from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
+from primdiffusion.training.captured_people import encode_people, read_cards
 
 
 def people(command: PeopleCommand, session: Session, report: ReportProgress) -> Path:
@@ -52,13 +52,12 @@ def encode(command: EncodePayloadsCommand, session: Session, report: ReportProgr
     Raises:
         ValueError, FileNotFoundError: captures or encoder are missing or damaged, or a subject failed; OSError.
     """
-    settings = EncodeSettings(command.views, command.looks, command.refine_steps, command.refine_size, command.seed)
     captures = open_captures(command.captures)
     cards = {} if command.people is None else read_cards(command.people)
     model = session.encoder(command.encoder)
     failed, total = 0, len(captures.subjects)
     with lock_folder(command.out):
-        for done, outcome in enumerate(encode_people(model, captures, command.out, settings, cards), 1):
+        for done, outcome in enumerate(encode_people(model, captures, command.out, command, cards), 1):
             failed += outcome.status == "failed"
             unknown = command.people is not None and outcome.subject not in cards
             note = outcome.error or ("attributes unknown" if unknown else "")

@@ -37,7 +37,6 @@ from primdiffusion.reconstruction.from_captures import reconstruct as reconstruc
 from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
 from primdiffusion.reconstruction.posture_start import write_posture
 from primdiffusion.render.descent import DescentSettings
-from primdiffusion.runtime.machine import peak_memory_gb
 from primdiffusion.training.refine import bare_body, refine, view_psnr
 
 STAGES = 4
@@ -75,12 +74,11 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
             body = model.body if isinstance(model, EncoderModel) else None
             person = captured_person(request.capture, request.subject, request.frame, request.views, body)
             report("encode", 2, STAGES, None)
-        found, backs = time.perf_counter(), _backs(request, folder)
+        backs = _backs(request, folder)
         if backs and isinstance(model, DiffusionModel):
             human, *others = draw_humans(model, person, (request.seed, *(back.seed for back in backs)), on_step)
         else:
             human, others = reconstruct_human(model, person, request.seed, on_step), []
-        encoded = time.perf_counter()
         report("write", STAGES if request.pictures else 3, STAGES, None)
         write_human(folder, human, request.size)
         for files, other in zip(backs, others, strict=True):
@@ -98,8 +96,6 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         seed=request.seed,
         warnings=[*warnings, *person.warnings],
         seconds=round(time.perf_counter() - began, 3),
-        seconds_encoding=round(encoded - found, 3),
-        peak_gb=round(peak_memory_gb(), 3),
     )
 
 

@@ -30,7 +30,7 @@ from primdiffusion.human import Human, body_of, framing, place, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import Anchors, default_anchors
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.cuda import march as cuda
+from primdiffusion.render import cuda
 from primdiffusion.render.image import rgba_to_png
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids

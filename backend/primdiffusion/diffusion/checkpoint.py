@@ -19,7 +19,7 @@ from torch import Tensor
 from primdiffusion.body.model import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.denoiser import LocalUNetConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import (
     BETAS,
@@ -72,15 +72,15 @@ class ModelConfig(Open):
     full_density: Annotated[float, Range(1e-30, LARGEST_NUMBER)]
     """Density of a stored value of 1, 1/m."""
     config: dict
-    """Sizes of the denoiser's networks: a DenoiserConfig or a UNetConfig."""
+    """Sizes of the denoiser's network: of a LocalUNetConfig under "local", or of a UNetConfig."""
     vocabulary: dict = dataclasses.field(default_factory=lambda: AttributeVocabulary({}, {}).to_json())
     """Attributes that the model can be conditioned on (`AttributeVocabulary.to_json`)."""
     body: str = ""
     """The user's body of a released model, as JSON (`BodyFiles.to_json`)."""
 
-    def denoiser(self) -> DenoiserConfig:
-        """Return the sizes of a PersonDenoiser. Raises FieldError."""
-        return read(DenoiserConfig, self.config)
+    def local(self) -> LocalUNetConfig | None:
+        """Return the sizes of a PersonDenoiser's network. Raises FieldError, and KeyError."""
+        return None if self.config["local"] is None else read(LocalUNetConfig, self.config["local"])
 
     def unet(self) -> UNetConfig:
         """Return the sizes of a U-Net. Raises FieldError."""
@@ -146,7 +146,8 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         architecture |= {"kind": "slab"}
     if not isinstance(model.denoiser, PersonDenoiser | SlabUNet):
         raise TypeError(f"checkpoints hold a PersonDenoiser or a SlabUNet, not a {type(model.denoiser).__name__}")
-    architecture["config"] = dataclasses.asdict(model.denoiser.config)
+    sizes = None if model.denoiser.config is None else dataclasses.asdict(model.denoiser.config)
+    architecture["config"] = {"local": sizes} if isinstance(model.denoiser, PersonDenoiser) else sizes
     halved = {key: value.half() if _is_halved(key, value) else value for key, value in tensors.items()}
     card = {key: value for key, value in model.card.items() if key != "sha256"}  # of the file it came from
     metadata = {
@@ -169,10 +170,10 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], ModelConfig, dict[st
     tensors, metadata, digest = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
         architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
-        if "detail" in architecture:
+        if "detail" in architecture or architecture.get("config", {}).get("person"):
             raise FileError(
                 path,
-                "has a detail decoder, which this version no longer reads",
+                "has a second network, which this version no longer reads",
                 "train a new checkpoint, or use the default one",
             )
         return tensors, read(ModelConfig, architecture), {**card, "sha256": digest}
@@ -246,7 +247,7 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
         surfaces = restore_surfaces(under(tensors, "surfaces."), vocabulary)
-        denoiser = tensor_file.load_network(lambda: PersonDenoiser(config.denoiser(), prior, schedule), weights)
+        denoiser = tensor_file.load_network(lambda: PersonDenoiser(config.local(), prior, schedule), weights)
     denoiser.eval().requires_grad_(False)
     chain = CHAINS[config.chain]
     density = float(config.full_density)

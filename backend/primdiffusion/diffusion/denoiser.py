@@ -1,8 +1,7 @@
-"""The default denoiser: a closed-form person prior, corrected by one network over components and one over the grid.
+"""The default denoiser: a closed-form person prior, whose guess of the rest is corrected by a network over the grid.
 
-A local network is slow to learn correlations over the whole body, such as one shirt's colour on 300 primitives. So a
-multilayer perceptron denoises the person components, which are few, and a small U-Net over the 32 x 32 grid denoises
-the rest.
+A local network is slow to learn correlations over the whole body, such as one shirt's colour on 300 primitives. So the
+prior denoises the person components, which are few, and a small U-Net over the 32 x 32 grid denoises the rest.
 """
 
 from __future__ import annotations
@@ -50,18 +49,6 @@ def step_features(t: Int[Tensor, "b"], features: int) -> Float[Tensor, "b featur
 
 
 @dataclasses.dataclass(frozen=True)
-class PersonNetworkConfig:
-    """Size of the perceptron over person components."""
-
-    width: int = 384
-    """Features of the residual stream."""
-    blocks: int = 4
-    """Residual blocks."""
-    dropout: float = 0.1
-    """Share of hidden features dropped in training; with few samples the perceptron overfits quickly."""
-
-
-@dataclasses.dataclass(frozen=True)
 class LocalUNetConfig:
     """Size of the U-Net over the 32 x 32 grid."""
 
@@ -77,49 +64,6 @@ class LocalUNetConfig:
     """Heads of the self-attention at 8 and 16 cells a side."""
     end_kernel: int = 1
     """Kernel size of the first and last convolution. They have the most channels: 3 makes a step a third slower."""
-
-
-class PersonBlock(nn.Module):
-    """LayerNorm modulated by the condition, then a perceptron with one hidden layer, added."""
-
-    def __init__(self, width: int, condition_width: int, dropout: float):
-        super().__init__()
-        self.norm = nn.LayerNorm(width, elementwise_affine=False)
-        self.film = nn.Linear(condition_width, 2 * width)
-        self.mlp = nn.Sequential(
-            nn.Linear(width, 2 * width), nn.SiLU(), nn.Dropout(dropout), zeroed(nn.Linear(2 * width, width))
-        )
-
-    def forward(self, x: Float[Tensor, "b f"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b f"]:
-        """The stream after this block."""
-        scale, shift = self.film(condition).chunk(2, dim=-1)
-        return x + self.mlp(self.norm(x) * (1 + scale) + shift)
-
-
-class PersonNetwork(nn.Module):
-    """Correction of the closed-form guess of R person components, all in units of standard deviations; starts at 0."""
-
-    def __init__(self, components: int, condition_width: int, config: PersonNetworkConfig):
-        super().__init__()
-        self.time = TimeEmbedding(64, 256)
-        self.asked = zeroed(nn.Linear(condition_width, 256, bias=False)) if condition_width else None
-        self.inner = nn.Linear(2 * components, config.width)
-        self.blocks = nn.ModuleList([PersonBlock(config.width, 256, config.dropout) for _ in range(config.blocks)])
-        self.outer = zeroed(nn.Linear(config.width, components))
-
-    def forward(
-        self,
-        noisy: Float[Tensor, "b r"],
-        guess: Float[Tensor, "b r"],
-        t: Int[Tensor, "b"],
-        condition: Float[Tensor, "b a"] | None = None,
-    ) -> Float[Tensor, "b r"]:
-        """Correction for noisy components and their closed-form guess at steps t; `condition` as of `Vocabulary`."""
-        condition = functional.silu(embedded(self.time(t), self.asked, condition))
-        x = self.inner(torch.cat([noisy, guess], dim=-1))
-        for block in self.blocks:
-            x = block(x, condition)
-        return self.outer(functional.silu(x))
 
 
 class LocalBlock(nn.Module):
@@ -251,29 +195,19 @@ def embedded(
     return time if asked is None or condition is None else time + asked(condition)
 
 
-@dataclasses.dataclass(frozen=True)
-class DenoiserConfig:
-    """Networks of the default denoiser; None means the closed form alone."""
-
-    person: PersonNetworkConfig | None = dataclasses.field(default_factory=PersonNetworkConfig)
-    """Network over the person components."""
-    local: LocalUNetConfig | None = dataclasses.field(default_factory=LocalUNetConfig)
-    """Network over the grid."""
-
-
 class PersonDenoiser(nn.Module):
-    """x0 guess of noisy latents: E[c | .] and E[r | .] of the prior plus learned corrections.
+    """x0 guess of noisy latents: E[c | .] of the prior, and its E[r | .] plus a learned correction.
 
-    Corrections are in units of the closed form's own posterior standard deviation, so they are of order 1 at every
-    noise level and vanish with the noise. They start at 0: an untrained denoiser is the prior's. The two parts are
-    orthogonal, so the squared error is the sum of theirs and each can be trained alone.
+    The correction is in units of the closed form's own posterior standard deviation, so it is of order 1 at every noise
+    level and vanishes with the noise. It starts at 0: an untrained denoiser is the prior's.
     """
 
     component_std: Tensor
     picture_std: Tensor
     prior_parity: Tensor
 
-    def __init__(self, config: DenoiserConfig, prior: PersonPrior, schedule: Schedule):
+    def __init__(self, config: LocalUNetConfig | None, prior: PersonPrior, schedule: Schedule):
+        """`config` is the size of the network; None means the closed form alone."""
         super().__init__()
         self.config, self.schedule = config, schedule
         self.network_dtype = torch.float32
@@ -286,9 +220,8 @@ class PersonDenoiser(nn.Module):
         self.register_buffer("picture_std", picture, persistent=False)
         channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], len(prior.parity)
         asked = prior.kind.shape[-1]
-        self.person = PersonNetwork(components, asked, config.person) if config.person else None
         drawn = prior.basis.shape[2]
-        self.local = LocalUNet(channels, components, grid, asked, config.local, drawn) if config.local else None
+        self.local = LocalUNet(channels, components, grid, asked, config, drawn) if config else None
         if self.local is not None:
             self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
@@ -327,27 +260,8 @@ class PersonDenoiser(nn.Module):
     def coefficients(
         self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
     ) -> Float[Tensor, "b r"]:
-        """Denoise person coefficients."""
-        likely = self.likely_coefficients(y, t, condition)
-        return likely if self.person is None else self.corrected(y, likely, t, condition)
-
-    def likely_coefficients(
-        self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None
-    ) -> Float[Tensor, "b r"]:
-        """The closed-form guess of person coefficients."""
+        """Denoise person coefficients, in closed form."""
         return self.prior.denoise_coefficients(y, *self.schedule.levels(t, y), condition)
-
-    def corrected(
-        self, y: Float[Tensor, "b r"], likely: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Tensor | None
-    ) -> Float[Tensor, "b r"]:
-        """The closed-form guess with the correction of the network over components, which must be there."""
-        assert self.person is not None
-        signal, noise = self.schedule.levels(t, y)
-        std = self.component_std
-        total = (signal**2 * std**2 + noise**2).sqrt()
-        with self._precision(y):
-            correction = self.person(y / total, likely / std, t, condition)
-        return likely + std * noise / total * correction
 
     def rest(
         self,
@@ -382,5 +296,5 @@ class PersonDenoiser(nn.Module):
         return guess, deviation, correction.float()
 
     def _precision(self, like: Tensor) -> torch.autocast:
-        """Autocast for the networks only: the closed form needs full precision."""
+        """Autocast for the network only: the closed form needs full precision."""
         return torch.autocast(like.device.type, self.network_dtype, enabled=self.network_dtype != torch.float32)

@@ -34,9 +34,6 @@ class HumanAnswer(Open):
     steps: Count | None = None
     edit: str | None = None
     """Kind of the edit; None for a new human."""
-    seconds_sampling: Seconds | None = None
-    peak_gb: float | None = None
-    """Most memory in use."""
 
     def __str__(self) -> str:
         """As the command line prints it."""
@@ -61,7 +58,6 @@ class ReconstructAnswer(HumanAnswer):
     frame: Count | None = None
     views: list[Count] | None = None
     """Numbers of the cameras."""
-    seconds_encoding: Seconds | None = None
     posture: Path | None = None
     """posture.json: pose, shape and cameras in pictures; None for captures."""
     fit: Percent | None = None
@@ -99,7 +95,6 @@ class VariationsAnswer(Open):
     seconds: Seconds
     warnings: list[str] = dataclasses.field(default_factory=list)
     """Sentences on humans that do not show what was asked for, which name their seeds."""
-    peak_gb: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from .joints import JOINT_NAMES
-from .schema import Ending, FieldError, Length, Option, Range, Shape, Slider
+from .schema import Checked, Ending, FieldError, Length, Option, Range, Shape, Slider
 
 Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
@@ -502,6 +502,23 @@ class GaussiansRequest:
         """Raise FieldError for one of object and joints without the other."""
         if (self.object is None) != (self.joints is None):
             raise FieldError(("object",), "and joints go together: give both, or neither for the T pose")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EncodeSettings(Checked):
+    """How captures become payloads, by the encoder."""
+
+    views: Count = 8
+    """Images to encode, spread around the subject; all if there are fewer."""
+    looks: Count = 1
+    """Frames of each subject to encode, evenly spaced; the first, near the T pose, has the least occlusion."""
+    refine_steps: Annotated[int, Range(0)] = 0
+    """Refinement steps on all images of the subject, which restore detail that the encoder blurs, such as 300; 0 for
+    none."""
+    refine_size: Pixels = 256
+    """Largest side of the images used in refinement, pixels."""
+    seed: Seed = 0
+    """Seed of the order of images in refinement."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
-from torch import Tensor
 
 from primdiffusion.formats.requests import Count, NotNegative
 from primdiffusion.formats.schema import Checked
@@ -105,29 +104,6 @@ def fit_payload(
 
         z = z + scale * conjugate_gradients(_curvature(views, scale), penalty, gradient, settings.iterations, _dot)
     return _payload(z.clip(0, limit), start)
-
-
-def influence(
-    payload: Payload,
-    targets: Sequence[PosedView],
-    full_density: float,
-    settings: InverseSettings = InverseSettings(),
-) -> Float32[Tensor, "K 2 8 8 8"]:
-    """How much each voxel counts in the images: the diagonal of J^T W J at a payload, mean over the images.
-
-    First of its linear colour, mean over the three channels; then of its density, in units of `full_density`. An image
-    weighs as in the fit: its error is the mean over the figure.
-
-    Raises:
-        ValueError: there are no targets, they are sRGB bytes, or `payload` is a batch.
-    """
-    _check(payload, targets)
-    diagonal = np.zeros_like(_voxels(payload))
-    for target in targets:
-        view = LinearisedView.of(target, payload, settings)
-        add_diagonal(view.jacobian, view.weight, view.alpha_free, diagonal)
-    found = np.stack([diagonal[:, :3].mean(1), diagonal[:, 3] * full_density**2]) / len(targets)
-    return torch.from_numpy(found.astype(np.float32)).unflatten(1, payload.density.shape).movedim(0, 1).contiguous()
 
 
 def fit_colours(

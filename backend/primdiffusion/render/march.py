@@ -13,8 +13,8 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import cuda
 from primdiffusion.render.cpu.march import march_cpu
-from primdiffusion.render.cuda import march as cuda
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span, check_camera, check_one_device
 from primdiffusion.render.reference import march_reference
@@ -99,8 +99,10 @@ def _march_at_once(
     primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None, batch: torch.Size
 ) -> Rendering:
     """Render all images with one call of `march_cuda`, without copying a single human seen in all of them."""
+    from primdiffusion.render.cuda.march import march_cuda  # Triton is optional
+
     people = _leading(primitives, PRIMITIVE_DIMENSIONS)
-    pictures = cuda.march_cuda(
+    pictures = march_cuda(
         _flat(primitives, PRIMITIVE_DIMENSIONS, batch if people.numel() > 1 else people),
         _flat(camera, CAMERA_DIMENSIONS, batch),
         settings,

@@ -3,14 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
-import sys
-from pathlib import Path
 
 import psutil
-
-if sys.platform != "win32":
-    import resource
 
 GB = 1e9
 DEVICES = ("cpu", "cuda", "mps")
@@ -31,18 +25,6 @@ def memory() -> dict[str, float]:
     """Total and available memory of the machine in GB (1e9 bytes)."""
     now = psutil.virtual_memory()
     return {"memory_gb": round(now.total / GB, 2), "memory_free_gb": round(now.available / GB, 2)}
-
-
-def peak_memory_gb() -> float:
-    """Peak memory of this process, GB (1e9 bytes)."""
-    if sys.platform == "win32":
-        return psutil.Process().memory_info().peak_wset / GB
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if sys.platform == "darwin":
-        return peak / GB
-    # Linux's ru_maxrss begins with the peak of the program that started this one; not every sandbox has VmHWM.
-    own = re.search(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="utf-8"), re.MULTILINE)
-    return (int(own[1]) if own else peak) * 1024 / GB
 
 
 def choose_device(name: str) -> None:

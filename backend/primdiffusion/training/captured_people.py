@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +22,7 @@ from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.files.arrays import read_arrays
 from primdiffusion.files.json_files import parse_json, read_json
 from primdiffusion.files.regular_files import as_file_error
-from primdiffusion.formats.requests import Count, Seed
-from primdiffusion.formats.schema import Checked, Range
+from primdiffusion.formats.requests import EncodeSettings
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
@@ -34,27 +33,11 @@ from primdiffusion.runtime.failures import describe
 from primdiffusion.training.refine import refine
 
 
-@dataclasses.dataclass(frozen=True)
-class EncodeSettings(Checked):
-    """Settings of encoding."""
-
-    views: Count = 8
-    """Input images of one frame, spread around the subject; all if there are fewer."""
-    looks: Count = 1
-    """Frames to encode, one payload each, evenly spaced from the first."""
-    refine_steps: Annotated[int, Range(0)] = 0
-    """Refinement steps on all images of all frames; 0 for none."""
-    refine_size: Count = 256
-    """Largest side of the images used in refinement, pixels."""
-    seed: Seed = 0
-    """Seed of the order of images in refinement."""
-
-
 def encode_people(
     model: EncoderModel,
     captures: Captures,
     out: Path,
-    settings: EncodeSettings = EncodeSettings(),
+    settings: EncodeSettings = EncodeSettings(),  # noqa: B008
     cards: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Iterator[SubjectResult]:
     """Write NAME.npz of every subject into `out`; yields each outcome and continues after failures.
@@ -68,7 +51,7 @@ def encode_people(
     about = {
         "captures": {key: value for key, value in captures.about.items() if key != "part_names"},
         "encoder": {"name": model.card.get("name", "unnamed"), "weights": _digest(model)},
-        **dataclasses.asdict(settings),
+        **{field.name: getattr(settings, field.name) for field in dataclasses.fields(EncodeSettings)},
     }
     for name in captures.subjects:
         card = (cards or {}).get(name, {})

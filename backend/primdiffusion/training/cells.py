@@ -1,4 +1,4 @@
-"""The preset `default`: a closed-form person prior on latents of cells, corrected by two light networks."""
+"""The preset `default`: a closed-form person prior on latents of cells, corrected by a light network."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.people.stored_people import PersonFolder, one_density
 from primdiffusion.runtime.device import has_fast_bfloat16
-from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
+from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.loop import Step
-from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
+from primdiffusion.training.losses import RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.surfaces import fit_surfaces
 
@@ -104,7 +104,7 @@ def _check_enough(samples: Sequence[int], config: PriorConfig) -> None:
 def load_base(path: Path) -> DiffusionModel:
     """Load a checkpoint to go on from. Raises ValueError unless it is of the default preset; FileNotFoundError."""
     model = load_checkpoint(path)
-    if not isinstance(model.denoiser, PersonDenoiser):
+    if not isinstance(model.denoiser, PersonDenoiser) or model.denoiser.local is None:
         raise ValueError(f"{path} is no checkpoint of the default preset: give another --start-from")
     return model
 
@@ -141,10 +141,9 @@ def _prepared_with(
 
 
 class CellTask(DiffusionTask):
-    """Trains a `PersonDenoiser`: first its network over person components, then the one over the grid.
+    """Trains the network of a `PersonDenoiser`, which starts with the weights of `base` if it is given."""
 
-    The networks start with the weights of `base` if it is given.
-    """
+    name = "local"
 
     def __init__(
         self, config: TrainingConfig, prepared: Prepared, device: torch.device, base: DiffusionModel | None = None
@@ -156,44 +155,34 @@ class CellTask(DiffusionTask):
         self.train, self.held = prepared.train.to(device), prepared.held.to(device)
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
         schedule = SCHEDULES[str(config.schedule)]()
-        sizes = config.model
-        if base is not None:
+        if base is None:
+            self.denoiser = PersonDenoiser(config.model, prepared.prior, schedule)
+        else:
             assert isinstance(base.denoiser, PersonDenoiser)  # as `load_base` has checked
-            sizes = base.denoiser.config
-
-        def build() -> PersonDenoiser:
-            return PersonDenoiser(sizes, prepared.prior, schedule)
-
-        self.denoiser = build() if base is None else tensor_file.load_network(build, base.denoiser.state_dict())
+            self.denoiser = PersonDenoiser(base.denoiser.config, prepared.prior, schedule)
+            self.denoiser.load_state_dict(base.denoiser.state_dict())
         self.denoiser.eval().requires_grad_(False).to(device)
-        phases = {"person": config.person, "local": config.local}
-        self._phases = {name: phase for name, phase in phases.items() if getattr(self.denoiser, name) is not None}
-        self._objectives: dict[str, PersonObjective | RestObjective] = {}
+        self.objective = RestObjective(self.denoiser, self.train, self.codec, self.vocabulary, config.local)
 
     @property
-    def phases(self) -> Mapping[str, PhaseConfig]:
-        """Return the settings of the network over components ("person") and of that over the grid ("local")."""
-        return self._phases
+    def settings(self) -> NetworkTraining:
+        """Return the settings of the network."""
+        return self.config.local
 
-    def network(self, phase: str) -> nn.Module:
-        """Return one of the two networks."""
-        return getattr(self.denoiser, phase)
+    def network(self) -> nn.Module:
+        """Return the network."""
+        assert self.denoiser.local is not None
+        return self.denoiser.local
 
-    def put(self, phase: str, network: nn.Module) -> None:
-        """Install a network, in the precision of its phase."""
-        setattr(self.denoiser, phase, network)
-        fast = self.phases[phase].bfloat16 and has_fast_bfloat16(self.device)
+    def put(self, network: nn.Module) -> None:
+        """Install a network, in the precision of its settings."""
+        self.denoiser.local = network
+        fast = self.settings.bfloat16 and has_fast_bfloat16(self.device)
         self.denoiser.network_dtype = torch.bfloat16 if fast else torch.float32
 
     def loss(self, step: Step) -> Mapping[str, Tensor]:
         """Weighted x0 error of a random batch at random levels."""
-        return {"loss": self.objective(step.phase).loss(step.generator)}
-
-    def objective(self, phase: str) -> PersonObjective | RestObjective:
-        """Return the objective of a network."""
-        if phase not in self._objectives:
-            self._objectives[phase] = self._objective(phase)
-        return self._objectives[phase]
+        return {"loss": self.objective.loss(step.generator)}
 
     def errors(self) -> Mapping[int, float]:
         """RMS x0 errors on the held-out set, in units of latents."""
@@ -209,22 +198,12 @@ class CellTask(DiffusionTask):
         return x0_errors(guesses, self.denoiser.schedule, self.held.latents)
 
     def model(self) -> DiffusionModel:
-        """Return the model with the installed networks, without a card."""
+        """Return the model with the installed network, without a card."""
         codec, denoiser = CellCodec(self.codec), self.denoiser
         return DiffusionModel(
             denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary,
             CHAINS[str(self.config.chain)], surfaces=self.surfaces,
         )  # fmt: skip
-
-    def _objective(self, phase: str) -> PersonObjective | RestObjective:
-        denoiser, settings = self.denoiser, self.phases[phase]
-        if phase == "local":
-            return RestObjective(denoiser, self.train, self.codec, self.vocabulary, settings)
-        prior = denoiser.prior
-        coefficients = torch.cat([prior.split(chunk.float())[0] for chunk in self.train.latents.split(128)])
-        # Components are fitted to these people and vary more over them than over new ones; the prior knows by how much.
-        coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
-        return PersonObjective(denoiser, coefficients, self.train, self.vocabulary, settings)
 
 
 def _save_prepared(path: Path, prepared: Prepared) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from primdiffusion.diffusion.denoiser import DenoiserConfig
+from primdiffusion.diffusion.denoiser import LocalUNetConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
@@ -84,7 +84,7 @@ class OptimiserSettings(Checked):
 
 
 @dataclasses.dataclass(frozen=True)
-class PhaseConfig(OptimiserSettings):
+class NetworkTraining(OptimiserSettings):
     """Training of one network of a diffusion model, each sample at a random noise level."""
 
     optimiser: Literal["adamw", "muon"] = "adamw"
@@ -136,7 +136,7 @@ class TrainingConfig(RunSettings):
     """Fraction of geometries, with all their colour variants, held out for evaluation."""
     more_data: Path | None = None
     """More humans, of `payloads --making from_mesh`: cheap, so they can be many, but blurred. The default preset learns
-    from them what noise does not hide: the closed form, and its networks at levels above t = 300."""
+    from them what noise does not hide: the closed form, and its network at levels above t = 300."""
     preset: Literal["default", "paper"] = "default"
     """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
     made_of: Literal["makehuman", "own"] = "own"
@@ -148,30 +148,26 @@ class TrainingConfig(RunSettings):
     """Timesteps in sampling: trailing (evenly spaced; for the paper preset), dense (denser at low noise) or early (down
     to t = 50, from which the mean is taken; for the default preset)."""
     start_from: Path | None = None
-    """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and sizes of
-    networks are kept, and the networks start with its weights."""
+    """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and size of the
+    network are kept, and the network starts with its weights."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
-    model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
-    person: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=700, batch=256, evaluate_every=350, bfloat16=True)
-    )
-    """The default preset's network over person components, trained first; with few humans more steps overfit."""
-    local: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(
+    model: LocalUNetConfig = dataclasses.field(default_factory=LocalUNetConfig)
+    local: NetworkTraining = dataclasses.field(
+        default_factory=lambda: NetworkTraining(
             steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True, optimiser="muon"
         )
     )
-    """The default preset's network over the grid."""
+    """Training of the default preset's network."""
     unet: UNetConfig = PAPER
     """Size of the paper preset's network."""
-    slab: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(
+    slab: NetworkTraining = dataclasses.field(
+        default_factory=lambda: NetworkTraining(
             steps=200_000, batch=8, learning_rate=1e-5, weight_decay=0.0, ema=0.9999, evaluate_every=5000,
             bfloat16=True,
         )
     )  # fmt: skip
-    """The only phase of the paper preset; the batch is that of each process."""
+    """Training of the paper preset's network; the batch is that of each process."""
 
     def __post_init__(self) -> None:
         """Fill in the defaults of the preset; raise ValueError for values out of range."""

@@ -26,8 +26,6 @@ from primdiffusion.training.state import TrainingState
 from primdiffusion.version import __version__
 
 MODEL = "model.safetensors"
-PHASES = ("person", "local", "slab")
-"""Networks of both presets."""
 CLOSED_FORM = ("closed_form_geometries", "closed_form_people")
 """What a card says of the people of a closed form that is not that of the training data."""
 DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fitted to renders of their meshes"
@@ -69,12 +67,12 @@ def train(config: TrainingConfig) -> DiffusionModel:
         with accelerator.main_process_first():
             if accelerator.is_main_process:
                 unseen = {"held": [people.names[index] for index in held]}
-                begin(config, people.names, unseen, PHASES, accelerator.num_processes)
+                begin(config, people.names, unseen, accelerator.num_processes)
             task = _task(config, people, chosen, held, accelerator.device)
-        states = loop.train(task, config, accelerator)
+        state = loop.train(task, config, accelerator)
         model = task.model()
         if accelerator.is_main_process:
-            card = _card(config, people, chosen, held, task, states)
+            card = _card(config, people, chosen, held, task, state)
             model = dataclasses.replace(model, card=card)
             save_checkpoint(config.run / MODEL, model, str(config.schedule))
         return model
@@ -96,10 +94,9 @@ def _card(
     chosen: Sequence[int],
     held: Sequence[int],
     task: CellTask | SlabTask,
-    states: Mapping[str, TrainingState],
+    state: TrainingState,
 ) -> dict[str, Any]:
     """The model card: data, settings and held-out errors."""
-    processes = next(iter(states.values())).accelerator.num_processes if states else 1
     card = {
         "name": f"PrimDiffusion {config.preset}",
         "version": __version__,
@@ -112,10 +109,10 @@ def _card(
         "seed": config.seed,
         "device": "CPU" if task.device.type == "cpu" else device_info(task.device)["device_name"],
         **versions(),
-        "steps": {name: state.step for name, state in states.items()},
-        "seconds": {name: round(state.seconds, 1) for name, state in states.items()},
-        "batch": {name: task.phases[name].batch * processes for name in states},
-        "parameters": sum(p.numel() for state in states.values() for p in state.network.parameters()),
+        "steps": {task.name: state.step},
+        "seconds": {task.name: round(state.seconds, 1)},
+        "batch": {task.name: task.settings.batch * state.accelerator.num_processes},
+        "parameters": sum(parameter.numel() for parameter in state.network.parameters()),
     }
     if config.start_from is not None:
         start = read_card(config.start_from)
@@ -146,8 +143,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
     config = tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train")
     model = train(config)
     if PartialState().is_main_process:
-        done = ", ".join(f"{name} {steps}" for name, steps in model.card["steps"].items())
-        print(f"{config.run / MODEL}  steps: {done}")
+        (steps,) = model.card["steps"].values()
+        print(f"{config.run / MODEL}  {steps} steps")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from primdiffusion.people.stored_people import PersonFolder, payload_of_bytes
 from primdiffusion.primitives.primitives import pack
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.runtime.device import has_bfloat16, has_fast_bfloat16
-from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.config import NetworkTraining, TrainingConfig
 from primdiffusion.training.loop import Step, Task
 from primdiffusion.training.losses import random_steps, x0_errors
 from primdiffusion.training.muon import MuonAdamW
@@ -48,8 +48,8 @@ class DiffusionTask(Task):
 
     @property
     @abstractmethod
-    def phases(self) -> Mapping[str, PhaseConfig]:
-        """Return the settings of the model's networks."""
+    def settings(self) -> NetworkTraining:
+        """Return the settings of the network."""
 
     @abstractmethod
     def errors(self) -> Mapping[int, float]:
@@ -57,14 +57,14 @@ class DiffusionTask(Task):
 
     @abstractmethod
     def model(self) -> DiffusionModel:
-        """Return the model with the networks in use, without a card."""
+        """Return the model with the network in use, without a card."""
 
-    def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
+    def optimiser(self, network: nn.Module) -> torch.optim.Optimizer:
         """Return Muon where the settings name it and the device has instructions for bfloat16, otherwise AdamW."""
-        settings = self.phases[phase]
+        settings = self.settings
         if settings.optimiser == "muon" and has_bfloat16(self.device):
             return MuonAdamW(network, settings.learning_rate, settings.weight_decay)
-        return super().optimiser(phase, network)
+        return super().optimiser(network)
 
     def held_out(self) -> Mapping[str, float]:
         """Return `errors`, named after their levels."""
@@ -92,13 +92,14 @@ def write_samples(
     write_png(path, to_bytes(torch.cat(pictures, dim=1)).numpy())
 
 
-NETWORK = "slab"
 MEASURED = 4
 """Held-out humans used in evaluation, one colouring each: a slab takes 15 MB, its evaluation the time of a step."""
 
 
 class SlabTask(DiffusionTask):
     """A `SlabUNet` and its training data: unweighted x0 error at uniform levels, as in the paper."""
+
+    name = "slab"
 
     def __init__(
         self,
@@ -116,15 +117,15 @@ class SlabTask(DiffusionTask):
         self.denoiser: nn.Module = SlabUNet(config.unet).to(device)
 
     @property
-    def phases(self) -> Mapping[str, PhaseConfig]:
-        """Return the single phase."""
-        return {NETWORK: self.config}
+    def settings(self) -> NetworkTraining:
+        """Return the settings of the U-Net."""
+        return self.config
 
-    def network(self, phase: str) -> nn.Module:
+    def network(self) -> nn.Module:
         """Return the U-Net."""
         return self.denoiser
 
-    def put(self, phase: str, network: nn.Module) -> None:
+    def put(self, network: nn.Module) -> None:
         """Use a network as the denoiser."""
         self.denoiser = network
 

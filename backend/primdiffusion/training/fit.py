@@ -29,7 +29,6 @@ from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
-from primdiffusion.training.fit_voxels import fit_missing, voxel_loss
 from primdiffusion.training.loop import Step, Task, train
 from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.state import TrainingState, adamw
@@ -73,16 +72,17 @@ def fit(config: FitConfig) -> EncoderModel:
         with accelerator.main_process_first():
             if accelerator.is_main_process:
                 about = {"captures": dict(captures.about)}
-                begin(config, captures.subjects, about, list(task.phases), accelerator.num_processes)
-        (state,) = train(task, config, accelerator).values()
+                begin(config, captures.subjects, about, accelerator.num_processes)
+        state = train(task, config, accelerator)
         if accelerator.is_main_process and not (config.run / MODEL).exists():
             task.save(state)  # stopped before the first step
         return task.model(state)
 
 
 class EncoderTask(Task):
-    """An encoder in training; its only network has no name, its place in the data is in the state's file."""
+    """An encoder in training; its place in the data is in the state's file."""
 
+    name = ""
     smaller = "fewer --targets, or a smaller --size"
 
     def __init__(self, config: FitConfig, captures: Captures, accelerator: Accelerator) -> None:
@@ -96,28 +96,25 @@ class EncoderTask(Task):
         self.dataset = fit_dataset(captures, config)
         if not len(self.dataset):
             raise ValueError(f"the captures in {config.data} have no frames: render some")
-        if config.fitted is not None and config.loss.voxels:
-            with accelerator.main_process_first():
-                fit_missing(captures, config.architecture, config.fitted)
         self._batches: Iterator[Batch] | None = None
 
     @property
-    def phases(self) -> Mapping[str, FitConfig]:
+    def settings(self) -> FitConfig:
         """Return the settings of the run."""
-        return {"": self.config}
+        return self.config
 
-    def network(self, phase: str) -> Encoder:
+    def network(self) -> Encoder:
         """Return the encoder that training starts from."""
         if self.start is not None:
             return self.start.encoder.float().requires_grad_(True).train()
         torch.manual_seed(self.config.seed)
         return Encoder(self.config.architecture)
 
-    def put(self, phase: str, network: nn.Module) -> None:
+    def put(self, network: nn.Module) -> None:
         """Use an encoder."""
         self.encoder = network
 
-    def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
+    def optimiser(self, network: nn.Module) -> torch.optim.Optimizer:
         """An untied bias is used once per image, a weight at every pixel: with equal rates the weights diverge."""
         biases = [module.bias for module in network.modules() if isinstance(module, UntiedConv)]
         known = {id(bias) for bias in biases}
@@ -140,23 +137,16 @@ class EncoderTask(Task):
         with self.accelerator.autocast():
             payload = self.encoder(sample.found, sample.axis_angle)
         payload = payload.to(dtype=torch.float32)
-        terms = {}
-        if number < config.hold_scale or sample.fitted is not None:
+        if number < config.hold_scale:
             # Multiplied by zero, because distributed training needs a gradient of every parameter.
             payload = dataclasses.replace(payload, delta_scale=sample.found.extent + 0 * payload.delta_scale)
-        if sample.fitted is not None:
-            fitted = voxel_loss(payload, sample.fitted, config.architecture.full_density)
-            terms["voxels"] = config.loss.voxels * fitted + 0 * payload.delta_scale.sum()
-        if not config.loss.of_images:
-            return terms
         primitives = Primitives.place(sample.frames, payload)
         views = primitives.map(lambda tensor: tensor[:, None])
         picture = march(views, sample.target.camera, MarchSettings(step=config.step))
         target, mask = sample.target.image.float() / 255, sample.target.mask.float() / 255
-        terms |= loss_terms(
+        return loss_terms(
             encode_srgb(picture.rgb), picture.alpha, primitives.half_extent, target, mask, config.loss, self.perceptual
         )
-        return terms
 
     def held_out(self) -> Mapping[str, float]:
         """Return the PSNR of training subjects and of those held out."""

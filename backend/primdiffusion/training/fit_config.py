@@ -26,24 +26,16 @@ class LossConfig(Checked):
     boxes, which start smaller, shrink until gaps appear."""
     alpha_prior: NotNegative = 0.0
     """mean log(0.1 + a) + log(1.1 - a) + 2.20727; the released code has 1."""
-    voxels: NotNegative = 0.0
-    """Square distance of voxels from those fitted to all images of the subject, in the units of rgb; delta scales then
-    keep their start. Needs `fitted`."""
     perceptual: NotNegative = 0.0
     """L1 distance of VGG19 features, [20, 5, .9, .5, .5]; the released code has 1. Needs `perceptual_weights`."""
     perceptual_weights: Path | None = None
     """A file of torchvision's VGG19 weights."""
 
-    @property
-    def of_images(self) -> bool:
-        """Whether a term compares images, so that the encoder's boxes must be marched."""
-        return bool(self.rgb or self.silhouette or self.alpha_prior or self.perceptual)
-
     def __post_init__(self) -> None:
         """Raise ValueError for weights that are negative or not finite, and without a weight of colours."""
         super().__post_init__()
-        if not (self.rgb or self.perceptual or self.voxels):
-            raise ValueError("loss.rgb, loss.perceptual and loss.voxels have no weight: nothing would teach colours")
+        if not (self.rgb or self.perceptual):
+            raise ValueError("loss.rgb and loss.perceptual have no weight: nothing would teach colours")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,9 +46,6 @@ class FitConfig(OptimiserSettings, SampleSettings, RunSettings):
     """Captures to train on."""
     held: Path | None = None
     """Captures of held-out subjects for evaluation."""
-    fitted: Path | None = None
-    """Folder of voxels fitted to all images of each subject, for loss.voxels; those that it lacks are made first, half
-    a minute each."""
     encoder: Preset = "default"
     """The shipped architecture, the paper's, or that of the authors' code."""
     ablation: Ablation | None = None
@@ -102,8 +91,6 @@ class FitConfig(OptimiserSettings, SampleSettings, RunSettings):
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""
         super().__post_init__()
-        if self.loss.voxels and self.fitted is None:
-            raise ValueError("the loss of voxels needs a folder for fitted ones: name it with --fitted")
         if self.loss.perceptual and self.loss.perceptual_weights is None:
             raise ValueError(
                 "the perceptual loss needs a file of VGG19's weights: name it with --loss.perceptual-weights"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int64
@@ -27,7 +26,6 @@ from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Frames
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_voxels import FittedVoxels, read_fitted, resampled
 
 CAUGHT = "Caught "
 """Start of the messages with which torch's loader wraps errors of workers; their traceback follows."""
@@ -44,8 +42,6 @@ class FitSample(TensorRecord):
     frames: Frames
     """Frames of the boxes in the pose of the targets, before delta scales."""
     target: Views
-    fitted: FittedVoxels | None
-    """Voxels fitted to all images of the subject, if they are a term of the loss."""
     subject: Int64[Tensor, "*b"]
     frame: Int64[Tensor, "*b"]
     """Frame of the targets."""
@@ -58,12 +54,9 @@ Batch = tuple[FitSample, Position]
 class FitDataset(SampleSet[FitSample]):
     """Samples of a `CaptureDataset`, unprojected in the workers that load them."""
 
-    def __init__(self, samples: CaptureDataset, encoder: EncoderConfig, fitted: Path | None = None) -> None:
-        """`fitted` is the folder of fitted voxels, if they are wanted.
-
-        Raises as `betas_of`, so that invalid subjects are errors before training starts.
-        """
-        self.samples, self.encoder, self.fitted = samples, encoder, fitted
+    def __init__(self, samples: CaptureDataset, encoder: EncoderConfig) -> None:
+        """Raises as `betas_of`, so that invalid subjects are errors before training starts."""
+        self.samples, self.encoder = samples, encoder
         self.betas = betas_of(samples.captures)
 
     def __len__(self) -> int:
@@ -71,19 +64,14 @@ class FitDataset(SampleSet[FitSample]):
         return len(self.samples)
 
     def __getitem__(self, position: tuple[int, int]) -> FitSample:
-        """Load the sample at a position. Raises as `CaptureDataset` and `read_fitted`."""
+        """Load the sample at a position. Raises as `CaptureDataset`."""
         sample = self.samples[position]
         given, target, betas = sample.conditioning, sample.target, self.betas[int(sample.subject)]
-        found, fitted = look_up(self.encoder, given, betas), None
-        if self.fitted is not None:
-            name = self.samples.captures.subjects[int(sample.subject)]
-            fitted = resampled(read_fitted(self.fitted, name), found.extent)
         return FitSample(
-            found=found,
+            found=look_up(self.encoder, given, betas),
             axis_angle=motion_of(given.pose.joint_rotation),
             frames=frames_of(self.encoder, betas, target.pose)[1],
             target=eroded(target) if self.encoder.masks == "eroded" else target,
-            fitted=fitted,
             subject=sample.subject,
             frame=sample.frame,
         )
@@ -101,8 +89,7 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
 
 def fit_dataset(captures: Captures, config: FitConfig) -> FitDataset:
     """Return the dataset of a run."""
-    fitted = config.fitted if config.loss.voxels else None
-    return FitDataset(CaptureDataset(captures, config, config.seed), config.architecture, fitted)
+    return FitDataset(CaptureDataset(captures, config, config.seed), config.architecture)
 
 
 def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: ProcessRank) -> Iterator[Batch]:

@@ -1,8 +1,8 @@
 """The loop in which every network is trained: steps, metrics, pictures, saved states, and a stop between two steps.
 
-    states = train(task, config, accelerator)       # resumes from the states in the run's folder
+    state = train(task, config, accelerator)        # resumes from the state in the run's folder
 
-A task gives networks, the loss of each, held-out errors and pictures: `fit.EncoderTask`, `cells.CellTask`,
+A task gives a network, its loss, held-out errors and pictures: `fit.EncoderTask`, `cells.CellTask`,
 `diffusion_task.SlabTask`.
 """
 
@@ -32,7 +32,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from primdiffusion.files.json_files import parse_message
 from primdiffusion.runtime.failures import out_of_memory
 from primdiffusion.training.config import OptimiserSettings, RunSettings
-from primdiffusion.training.run_folder import PICTURES, Metrics, open_metrics, state_path
+from primdiffusion.training.run_folder import PICTURES, STATE, Metrics, open_metrics
 from primdiffusion.training.state import TrainingState, adamw, agreed
 
 log = logging.getLogger(__name__)
@@ -48,13 +48,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Step:
     """One optimiser step, as its loss sees it."""
 
-    phase: str
     number: int
     """Completed steps."""
     generator: torch.Generator
-    """Random numbers on the device that depend on seed, phase, step and process only, as torch's own do in a step."""
+    """Random numbers on the device that depend on seed, step and process only, as torch's own do in a step."""
     place: dict[str, str]
-    """State of the task in this phase, saved and restored with the network."""
+    """State of the task, saved and restored with the network."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,27 +68,29 @@ class StepMetrics:
 
 
 class Task(ABC):
-    """What is trained: networks, one after another."""
+    """What is trained: a network."""
 
+    name: str
+    """Name of the network, before its settings on the command line; "" where they stand alone."""
     smaller: str
     """What to try if a batch of 1 does not fit into memory."""
 
     @property
     @abstractmethod
-    def phases(self) -> Mapping[str, OptimiserSettings]:
-        """Return the settings of each network by its name, in the order of training; a single one may be named ""."""
+    def settings(self) -> OptimiserSettings:
+        """Return the settings of the network's training."""
 
     @abstractmethod
-    def network(self, phase: str) -> nn.Module:
-        """Return a network as initialised."""
+    def network(self) -> nn.Module:
+        """Return the network as initialised."""
 
     @abstractmethod
-    def put(self, phase: str, network: nn.Module) -> None:
+    def put(self, network: nn.Module) -> None:
         """Use this network from now on: the one in training, or its average."""
 
-    def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
-        """Return the optimiser of a network; the "factor" of a parameter group multiplies the learning rate."""
-        return adamw(self.phases[phase], network.parameters())
+    def optimiser(self, network: nn.Module) -> torch.optim.Optimizer:
+        """Return the optimiser; the "factor" of a parameter group multiplies the learning rate."""
+        return adamw(self.settings, network.parameters())
 
     @abstractmethod
     def loss(self, step: Step) -> Mapping[str, Tensor]:
@@ -97,21 +98,21 @@ class Task(ABC):
 
     @abstractmethod
     def held_out(self) -> Mapping[str, float]:
-        """Evaluate the networks in use."""
+        """Evaluate the network in use."""
 
     @abstractmethod
     def draw(self, path: Path) -> None:
-        """Write a picture of what the networks in use make. Raises OSError."""
+        """Write a picture of what the network in use makes. Raises OSError."""
 
     @abstractmethod
     def save(self, state: TrainingState) -> None:
         """Write what belongs to a state that is about to be saved."""
 
 
-def train(task: Task, config: RunSettings, accelerator: Accelerator) -> dict[str, TrainingState]:
-    """Train or resume the networks of a task until their last steps or an interrupt; returns their states.
+def train(task: Task, config: RunSettings, accelerator: Accelerator) -> TrainingState:
+    """Train or resume the network of a task until its last step or an interrupt; returns its state.
 
-    The averages are in use afterwards. States are saved at intervals and at the end. Ctrl-C, SIGTERM and the time limit
+    The average is in use afterwards. The state is saved at intervals and at the end. Ctrl-C, SIGTERM and the time limit
     end a run between two steps.
 
     Raises:
@@ -121,21 +122,21 @@ def train(task: Task, config: RunSettings, accelerator: Accelerator) -> dict[str
     """
     recorded = open_metrics(config) if accelerator.is_main_process else contextlib.nullcontext()
     with Interrupt(config.minutes) as interrupt, logging_redirect_tqdm(), recorded as metrics:
-        return {phase: _train_phase(task, phase, config, accelerator, interrupt, metrics) for phase in task.phases}
+        return _train(task, config, accelerator, interrupt, metrics)
 
 
-def _train_phase(
-    task: Task, phase: str, config: RunSettings, accelerator: Accelerator, interrupt: Interrupt, metrics: Metrics | None
+def _train(
+    task: Task, config: RunSettings, accelerator: Accelerator, interrupt: Interrupt, metrics: Metrics | None
 ) -> TrainingState:
-    path, steps = state_path(config.run, phase), task.phases[phase].steps
-    state = begin_phase(task, phase, accelerator)
+    path, steps = config.run / STATE, task.settings.steps
+    state = begin_training(task, accelerator)
     if path.exists():
         state.load(path)
     saved, seconds = state.step, state.seconds
     began = last = time.monotonic()
-    with Recorder(task, phase, config, state, metrics) if metrics else contextlib.nullcontext() as recorder:
+    with Recorder(task, config, state, metrics) if metrics else contextlib.nullcontext() as recorder:
         while state.step < steps and not agreed(accelerator, interrupt.due()):
-            progress = take_step(task, phase, config.seed, state)
+            progress = take_step(task, config.seed, state)
             state.seconds = seconds + time.monotonic() - began
             if recorder is None:
                 continue
@@ -146,45 +147,44 @@ def _train_phase(
         if recorder is not None and state.step > saved:
             _save(task, state, path)
     accelerator.wait_for_everyone()
-    task.put(phase, state.average)
+    task.put(state.average)
     return state
 
 
-def begin_phase(task: Task, phase: str, accelerator: Accelerator) -> TrainingState:
-    """Return the state of a network before its first step, and use the network. Raises ValueError: out of memory."""
-    with _memory_named(task, phase):
-        network = task.network(phase).requires_grad_(True).to(accelerator.device)
-        state = TrainingState(network, task.phases[phase], accelerator, task.optimiser(phase, network))
-    task.put(phase, state.prepared)
+def begin_training(task: Task, accelerator: Accelerator) -> TrainingState:
+    """Return the state of the network before its first step, and use the network. Raises ValueError: out of memory."""
+    with _memory_named(task):
+        network = task.network().requires_grad_(True).to(accelerator.device)
+        state = TrainingState(network, task.settings, accelerator, task.optimiser(network))
+    task.put(state.prepared)
     return state
 
 
-def take_step(task: Task, phase: str, seed: int, state: TrainingState) -> StepMetrics:
-    """Take one optimiser step; its random numbers depend only on seed, phase, step and process.
+def take_step(task: Task, seed: int, state: TrainingState) -> StepMetrics:
+    """Take one optimiser step; its random numbers depend only on seed, name, step and process.
 
     Raises ValueError: the loss or its gradient is not finite; out of memory.
     """
     device = state.accelerator.device
-    seed = step_seed(seed, phase, state.step, state.accelerator.process_index)
+    seed = step_seed(seed, task.name, state.step, state.accelerator.process_index)
     torch.manual_seed(seed)
     generator, began = torch.Generator(device).manual_seed(seed), time.perf_counter()
     state.prepared.train()
-    with _memory_named(task, phase):
-        terms = task.loss(Step(phase, state.step, generator, state.place))
+    with _memory_named(task):
+        terms = task.loss(Step(state.step, generator, state.place))
         values = {name: float(term.detach()) for name, term in terms.items()}
         if bad := [name for name, value in values.items() if not math.isfinite(value)]:
-            which = f"of {phase!r}" if phase else f"({', '.join(bad)})"
             raise ValueError(
-                f"the loss {which} at step {state.step} is not finite: lower {_option(phase, 'learning-rate')} in a "
-                "new run folder"
+                f"the loss ({', '.join(bad)}) at step {state.step} is not finite: lower "
+                f"{_option(task, 'learning-rate')} in a new run folder"
             )
         gradient = state.update(torch.stack(list(terms.values())).sum())
     return StepMetrics(values, gradient, time.perf_counter() - began)
 
 
-def step_seed(seed: int, phase: str, step: int, process: int) -> int:
-    """The seed of one step's random numbers on one process, 0 ... 2^63 - 1."""
-    digest = hashlib.sha256(f"{seed}/{phase}/{step}/{process}".encode()).digest()
+def step_seed(seed: int, name: str, step: int, process: int) -> int:
+    """The seed of one step's random numbers on one process, 0 ... 2^63 - 1; `name` is the network's."""
+    digest = hashlib.sha256(f"{seed}/{name}/{step}/{process}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
 
 
@@ -193,40 +193,35 @@ def _save(task: Task, state: TrainingState, path: Path) -> None:
     state.save(path)
 
 
-def _option(phase: str, name: str) -> str:
-    return f"--{phase}.{name}" if phase else f"--{name}"
+def _option(task: Task, name: str) -> str:
+    return f"--{task.name}.{name}" if task.name else f"--{name}"
 
 
 @contextlib.contextmanager
-def _memory_named(task: Task, phase: str) -> Iterator[None]:
+def _memory_named(task: Task) -> Iterator[None]:
     """Turn out-of-memory errors into a ValueError that says what to try."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
         if not out_of_memory(error):
             raise
-        batch = task.phases[phase].batch
-        remedy = f"{_option(phase, 'batch')} {batch // 2}" if batch > 1 else task.smaller
+        batch = task.settings.batch
+        remedy = f"{_option(task, 'batch')} {batch // 2}" if batch > 1 else task.smaller
         raise ValueError(f"out of memory for a batch of {batch}: try {remedy} in a new run folder") from error
 
 
 class Recorder:
-    """Writes metrics and pictures of a phase and shows a progress bar, in the main process.
+    """Writes metrics and pictures of a run and shows a progress bar, in the main process.
 
     Running means are saved in the state, so that a resumed run writes the same lines as an uninterrupted one.
     """
 
-    def __init__(self, task: Task, phase: str, config: RunSettings, state: TrainingState, metrics: Metrics) -> None:
-        self.task, self.phase, self.config, self.state, self.metrics = task, phase, config, state, metrics
-        self.settings = task.phases[phase]
+    def __init__(self, task: Task, config: RunSettings, state: TrainingState, metrics: Metrics) -> None:
+        self.task, self.config, self.state, self.metrics = task, config, state, metrics
         self.means: dict[str, float] = parse_message(state.place.get("means", "{}"))
-        earlier = list(task.phases)[: list(task.phases).index(phase)]
-        self._before = sum(task.phases[name].steps for name in earlier)
 
     def __enter__(self) -> Recorder:
-        self.bar = tqdm(
-            total=self.settings.steps, initial=self.state.step, desc=self.phase or None, unit="step", disable=None
-        )
+        self.bar = tqdm(total=self.task.settings.steps, initial=self.state.step, unit="step", disable=None)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -243,33 +238,30 @@ class Recorder:
         self.bar.update()
         if self._due(self.config.log_every):
             self._write(self.means)
-        if self._due(self.settings.evaluate_every):
+        if self._due(self.task.settings.evaluate_every):
             with self._averaged():
                 self._write(self.task.held_out())
         if self._due(self.config.pictures_every):
-            name = f"{self.phase}_{step:07d}.png" if self.phase else f"{step:07d}.png"
             with self._averaged():
-                self.task.draw(self.config.run / PICTURES / name)
+                self.task.draw(self.config.run / PICTURES / f"{step:07d}.png")
 
     def _due(self, every: int) -> bool:
-        return self.state.step % every == 0 or self.state.step == self.settings.steps
+        return self.state.step % every == 0 or self.state.step == self.task.settings.steps
 
     @contextlib.contextmanager
     def _averaged(self) -> Iterator[None]:
-        self.task.put(self.phase, self.state.average)
+        self.task.put(self.state.average)
         try:
             yield
         finally:
-            self.task.put(self.phase, self.state.prepared)
+            self.task.put(self.state.prepared)
 
     def _write(self, values: Mapping[str, float]) -> None:
-        step, steps = self.state.step, self.settings.steps
+        step, steps = self.state.step, self.task.settings.steps
         left = (steps - step) * self.means["seconds_step"]
         shown = " ".join(f"{name}={value:.4g}" for name, value in values.items())
-        of = f"{self.phase}, " if self.phase else ""
-        log.info("%sstep %d of %d, %s left: %s", of, step, steps, tqdm.format_interval(left), shown)
-        phase = {"phase": self.phase} if self.phase else {}
-        self.metrics.append({**phase, "step": step, "seconds": self.state.seconds, **values}, self._before + step)
+        log.info("step %d of %d, %s left: %s", step, steps, tqdm.format_interval(left), shown)
+        self.metrics.append({"step": step, "seconds": self.state.seconds, **values})
 
 
 class Interrupt:

@@ -1,4 +1,4 @@
-"""Objectives of the default denoiser's two networks, and the evaluation error.
+"""Objective of the default denoiser's network, and the evaluation error.
 
 Random numbers are drawn on the device of their generator, which must be that of the samples.
 """
@@ -8,13 +8,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
@@ -22,7 +20,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.render.cuda.graph import RecordedLoss
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 
 LEVELS = (50, 100, 300, 500, 700, 900)
@@ -46,27 +44,18 @@ def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> 
     return (weight / weight.mean(1, keepdim=True) * error.flatten(1).square()).mean()
 
 
-class Objective(ABC):
-    """Loss of one of the denoiser's networks, on a CUDA device recorded with its gradients."""
+@dataclasses.dataclass
+class RestObjective:
+    """Loss of the local network: the rest, given the closed form's guess of the coefficients.
 
-    name: ClassVar[str]
+    On a CUDA device it is recorded with its gradients.
+    """
+
     denoiser: PersonDenoiser
-
-    @property
-    def network(self) -> nn.Module:
-        """The network to train."""
-        network = getattr(self.denoiser, self.name)
-        if network is None:
-            raise ValueError("this denoiser was configured without the network that is to be trained: give it a size")
-        return network
-
-    @abstractmethod
-    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
-        """Draw people and levels, and compute what the network does not change."""
-
-    @abstractmethod
-    def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch; does not wait for the device."""
+    people: LatentSet
+    codec: LinearCodec
+    vocabulary: AttributeVocabulary
+    config: NetworkTraining
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
@@ -74,49 +63,8 @@ class Objective(ABC):
 
     @functools.cached_property
     def _recorded(self) -> RecordedLoss:
-        return RecordedLoss(self.error, self.network)
-
-
-@dataclasses.dataclass
-class PersonObjective(Objective):
-    """Loss of the network over person components; cheap, as it needs no latent grids."""
-
-    name = "person"
-    denoiser: PersonDenoiser
-    coefficients: Float[Tensor, "n r"]
-    people: LatentSet
-    vocabulary: AttributeVocabulary
-    config: PhaseConfig
-
-    def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
-        """Draw noisy coefficients; return them with their closed-form guess, step, condition and the clean ones."""
-        spread = float(self.denoiser.component_std.square().mean().sqrt())
-        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
-        weights, indices = blends(self.people, t, self.config.blend, generator)
-        condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
-        c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
-        y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
-        return y, self.denoiser.likely_coefficients(y, t, condition), t, condition, c
-
-    def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch."""
-        y, likely, t, condition, c = batch
-        signal, noise = self.denoiser.schedule.levels(t, c)
-        std = self.denoiser.component_std
-        std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        return weighted_error((self.denoiser.corrected(y, likely, t, condition) - c) / std, std)
-
-
-@dataclasses.dataclass
-class RestObjective(Objective):
-    """Loss of the local network: the rest, given the person network's coefficients."""
-
-    name = "local"
-    denoiser: PersonDenoiser
-    people: LatentSet
-    codec: LinearCodec
-    vocabulary: AttributeVocabulary
-    config: PhaseConfig
+        assert self.denoiser.local is not None
+        return RecordedLoss(self.error, self.denoiser.local)
 
     @torch.no_grad()
     def batch(self, generator: torch.Generator) -> tuple[Tensor, ...]:
@@ -135,14 +83,14 @@ class RestObjective(Objective):
         return rest, self.denoiser.coefficients(y, t, condition), t, condition, clean
 
     def error(self, *batch: Tensor) -> Tensor:
-        """Weighted x0 error of a batch."""
+        """Weighted x0 error of a batch; does not wait for the device."""
         rest, coefficients, t, condition, clean = batch
         guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
         return weighted_error((guess - clean) / std + correction, std)
 
 
 def random_steps(
-    schedule: Schedule, count: int, generator: torch.Generator, config: PhaseConfig, spread: float = 1.0
+    schedule: Schedule, count: int, generator: torch.Generator, config: NetworkTraining, spread: float = 1.0
 ) -> Int[Tensor, "b"]:
     """Random steps, distributed as `config.levels` says: uniform in t is the paper's (eq. 9).
 

@@ -17,7 +17,7 @@ from primdiffusion.render.cuda.graph import Recorded
 BETAS = (0.9, 0.99)
 """Decay of AdamW's two moments."""
 ENDS = ("inner", "outer", "asked")
-"""Layers that meet data rather than features, by name in the networks of the default preset; left to AdamW."""
+"""Layers that meet data rather than features, by name in the network of the default preset; left to AdamW."""
 FACTOR = 3.0
 """Muon's learning rate over AdamW's."""
 

@@ -4,7 +4,7 @@ config.json                 the settings
 run.json                    the training set; steps, processes, versions and commit of every start
 metrics.jsonl               metrics at intervals, which TensorBoard or Weights & Biases get as well if asked for
 pictures/                   images at intervals
-[PHASE.]state.safetensors   the state of a network, to resume from
+state.safetensors           the state of the network, to resume from
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from primdiffusion.version import __version__
 
 log = logging.getLogger(__name__)
 
-CONFIG, RUN, METRICS, PICTURES = "config.json", "run.json", "metrics.jsonl", "pictures"
+CONFIG, RUN, METRICS, PICTURES, STATE = "config.json", "run.json", "metrics.jsonl", "pictures", "state.safetensors"
 LARGEST_TEXT = 2**30
 """Largest size of one of them, bytes."""
 
@@ -59,17 +59,10 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
         accelerator.end_training()
 
 
-def state_path(run: Path, phase: str) -> Path:
-    """Path of the saved state of a phase."""
-    return run / (f"{phase}.state.safetensors" if phase else "state.safetensors")
-
-
-def begin(
-    config: RunSettings, people: Sequence[str], about: Mapping[str, Any], phases: Sequence[str], processes: int
-) -> None:
+def begin(config: RunSettings, people: Sequence[str], about: Mapping[str, Any], processes: int) -> None:
     """Save settings, versions and names of the training set; when resuming, check that these are unchanged.
 
-    `about` is saved with the names. Lines of metrics.jsonl of steps after the saved states, which were lost in a kill,
+    `about` is saved with the names. Lines of metrics.jsonl of steps after the saved state, which were lost in a kill,
     are removed.
 
     Raises:
@@ -77,17 +70,15 @@ def begin(
         OSError: the folder cannot be written to.
     """
     log.info("training on %d %s", processes, "process" if processes == 1 else "processes, each with its own batches")
-    steps = {phase: saved_step(state_path(config.run, phase)) for phase in phases}
-    saved, noted = config.run / CONFIG, config.run / RUN
+    step, saved, noted = saved_step(config.run / STATE), config.run / CONFIG, config.run / RUN
     started = {"people": list(people), **about, "starts": []}
     if saved.exists():
         check_resumable(_text(saved), config)
         if noted.exists():
             started["starts"] = _earlier(config, people, _text(noted), processes)
-        _cut_metrics(config.run / METRICS, steps)
+        _cut_metrics(config.run / METRICS, step)
         remove_abandoned(config.run, after_s=0)
-    done = {"step": steps[""]} if "" in steps else {"steps": {phase: step for phase, step in steps.items() if step}}
-    now = {**done, "processes": processes, "primdiffusion": __version__, **versions()}
+    now = {"step": step, "processes": processes, "primdiffusion": __version__, **versions()}
     write_atomically(saved, to_json(config))
     write_atomically(noted, json.dumps({**started, "starts": [*started["starts"], now]}, indent=1))
 
@@ -99,11 +90,8 @@ class Metrics:
     run: Path
     tracker: GeneralTracker | None = None
 
-    def append(self, row: Mapping[str, float | str], step: int) -> None:
-        """Append a line; `step` rises over all phases of a run. Raises OSError, naming the file.
-
-        A tracker gets the numbers of the line, named PHASE/NAME if it has a phase.
-        """
+    def append(self, row: Mapping[str, float]) -> None:
+        """Append a line, with its step. Raises OSError, naming the file."""
         path = self.run / METRICS
         try:
             with open_to_append(path) as file:
@@ -111,9 +99,7 @@ class Metrics:
         except OSError as error:
             raise type(error)(error.errno, error.strerror, str(path)) from error
         if self.tracker is not None:
-            prefix = f"{row['phase']}/" if "phase" in row else ""
-            numbers = {prefix + name: value for name, value in row.items() if not isinstance(value, str)}
-            self.tracker.log(numbers, step=step)
+            self.tracker.log(dict(row), step=int(row["step"]))
 
 
 @contextlib.contextmanager
@@ -169,17 +155,16 @@ def _earlier(config: RunSettings, people: Sequence[str], saved: str, processes: 
     return starts
 
 
-def _cut_metrics(path: Path, steps: Mapping[str, int]) -> None:
+def _cut_metrics(path: Path, step: int) -> None:
     if path.exists():
         lines = _text(path).splitlines()
-        write_atomically(path, "".join(line + "\n" for line in lines if _is_kept(line, steps)))
+        write_atomically(path, "".join(line + "\n" for line in lines if _is_kept(line, step)))
 
 
-def _is_kept(line: str, steps: Mapping[str, int]) -> bool:
+def _is_kept(line: str, step: int) -> bool:
     """Whether a line is complete and of a step that is saved."""
     try:
-        row = parse_json(line)
-        return row["step"] <= steps[row.get("phase", "")]
+        return parse_json(line)["step"] <= step
     except (ValueError, LookupError, TypeError, AttributeError):
         return False
 

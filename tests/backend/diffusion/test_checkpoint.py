@@ -7,7 +7,7 @@ import torch
 from diffusion_people import COMPONENTS, VOCABULARY, small_model
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample, unfollowed, warnings_of
 from primdiffusion.diffusion.pretrained import model_card, save_pretrained
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
@@ -92,7 +92,7 @@ def test_components_of_parts_are_stored_by_half_and_read_again(path):
     whole = (pictures + signs * codec.mirror(pictures)) / 100
     basis = in_cells(whole.flatten(1))[:, order].contiguous()
     prior = dataclasses.replace(denoiser.prior, basis=basis, parity=parity)
-    model = dataclasses.replace(model, denoiser=PersonDenoiser(DenoiserConfig(None, None), prior, model.schedule))
+    model = dataclasses.replace(model, denoiser=PersonDenoiser(None, prior, model.schedule))
     save_checkpoint(path, model, "linear")
     read = load_checkpoint(path).denoiser.prior
     with safe_open(path, framework="pt") as file:
@@ -150,15 +150,15 @@ def test_a_file_of_another_kind_or_version_is_rejected(path, entry, text):
 
 
 def test_weights_that_are_not_numbers_are_named(path):
-    rewrite(path, lambda t: t | {"denoiser.person.outer.bias": torch.full((6,), float("nan"))})
-    with refused(FileError, "person.outer.bias"):
+    rewrite(path, lambda t: t | {"denoiser.local.outer.bias": torch.full((4,), float("nan"))})
+    with refused(FileError, "local.outer.bias"):
         load_checkpoint(path)
 
 
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda t: {k: v for k, v in t.items() if k != "denoiser.person.outer.weight"},
+        lambda t: {k: v for k, v in t.items() if k != "denoiser.local.outer.weight"},
         lambda t: t | {"denoiser.prior_surplus": torch.zeros(1)},
     ],
 )
@@ -201,7 +201,7 @@ def test_a_network_larger_than_its_file_is_not_built(path, local):
 
 def test_an_unfinished_model_is_not_saved(tmp_path):
     model = small_model()
-    model.denoiser.person.outer.bias.fill_(float("inf"))
+    model.denoiser.local.outer.bias.fill_(float("inf"))
     with refused(FileError, "NaN"):
         save_checkpoint(tmp_path / "bad.safetensors", model, "linear")
     assert list(tmp_path.iterdir()) == []
@@ -275,7 +275,7 @@ def test_a_model_without_kinds_reads_nothing():
 
 def without_kinds() -> PersonDenoiser:
     prior = dataclasses.replace(MODEL.denoiser.prior, kind=torch.zeros(1, 2, 0))
-    return PersonDenoiser(DenoiserConfig(person=None, local=None), prior, MODEL.schedule)
+    return PersonDenoiser(None, prior, MODEL.schedule)
 
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

@@ -2,7 +2,7 @@ import pytest
 import torch
 from diffusion_people import CHANNELS, COMPONENTS, SMALL, random_prior
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser, step_features
+from primdiffusion.diffusion.denoiser import PersonDenoiser, step_features
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet, UNetConfig
 from support.errors import refused
@@ -59,8 +59,7 @@ def prior():
 
 def test_the_prior_follows_a_state_that_is_loaded_after_its_first_use():
     first, second = (
-        PersonDenoiser(DenoiserConfig(None, None), random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed), linear())
-        for seed in (0, 1)
+        PersonDenoiser(None, random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed), linear()) for seed in (0, 1)
     )
     x, t = torch.randn(2, CHANNELS, GRID, GRID, dtype=torch.float64), torch.tensor([300, 700])
     assert not torch.allclose(first(x, t), second(x, t))
@@ -69,7 +68,7 @@ def test_the_prior_follows_a_state_that_is_loaded_after_its_first_use():
     assert torch.allclose(first(x, t), second(x, t))
 
 
-@pytest.mark.parametrize("config", [SMALL, DenoiserConfig(None, None), DenoiserConfig(SMALL.person, None)])
+@pytest.mark.parametrize("config", [SMALL, None])
 def test_untrained_denoiser_is_the_closed_form(prior, config):
     denoiser = PersonDenoiser(config, prior, linear()).eval()
     x, t = 3 * torch.randn(5, CHANNELS, GRID, GRID), torch.tensor([0, 100, 400, 800, 999])
@@ -80,7 +79,6 @@ def test_untrained_denoiser_is_the_closed_form(prior, config):
 def test_corrections_vanish_with_the_noise(prior):
     torch.manual_seed(0)
     denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
-    torch.nn.init.normal_(denoiser.person.outer.weight)
     torch.nn.init.normal_(denoiser.local.outer.weight)
     x = prior.sample(4, torch.Generator().manual_seed(0))
     with torch.no_grad():

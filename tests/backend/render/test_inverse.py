@@ -17,10 +17,8 @@ from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import (
     BACKGROUND,
     InverseSettings,
-    LinearisedView,
     fit_colours,
     fit_payload,
-    influence,
 )
 from support.errors import refused
 
@@ -160,29 +158,6 @@ def test_a_mesh_without_textures_is_named():
         fitted_payloads([TexturedMesh((bare,))], FRAMES, np.zeros(10), None)
     with refused(ValueError, "colouring"):
         fitted_payloads([], FRAMES, np.zeros(10), None)
-
-
-def test_influence_is_the_square_change_of_the_images_by_a_voxel():
-    payload, views = random_payload(5), cameras(3, size=24)
-    payload = dataclasses.replace(payload, density=0.03 * payload.density)  # no opaque ray: alpha follows density
-    targets = pictures(payload, views)
-    found = influence(payload, targets, FULL)
-    assert found.shape == (SIDE**2, 2, 8, 8, 8)
-    weights = [LinearisedView.of(target, payload, InverseSettings()).weight for target in targets]
-    for box, depth, row, column in [(4, 3, 4, 4), (0, 4, 2, 5), (8, 1, 6, 3)]:
-        place = box, depth, row, column
-        brighter, denser = payload.rgb.clone(), payload.density.clone()
-        brighter[box, :, depth, row, column] += 1e-2
-        denser[place] += 1e-2 * FULL
-        for kind, changed in enumerate(
-            (dataclasses.replace(payload, rgb=brighter), dataclasses.replace(payload, density=denser))
-        ):
-            squares = []
-            for target, weight in zip(targets, weights, strict=True):
-                after, before = over_grey(changed, target.camera), over_grey(payload, target.camera)
-                squares.append((weight * ((after - before) / 1e-2) ** 2).sum() / (1 if kind else 3))
-            expected = float(np.mean(squares))
-            assert float(found[box, kind, depth, row, column]) == pytest.approx(expected, rel=0.05, abs=1e-7)
 
 
 def over_grey(payload: Payload, camera: Camera) -> np.ndarray:

@@ -11,8 +11,8 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import cuda
 from primdiffusion.render.cpu.march import march_cpu
-from primdiffusion.render.cuda import march as cuda
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span
 from primdiffusion.render.march import march
@@ -149,6 +149,7 @@ def test_on_cuda_devices_a_batch_is_one_call_and_one_person_is_not_copied(settin
         pictures = [march_cpu(person, one(camera, i), settings) for i, person in enumerate(people)]
         return Rendering(*(torch.stack([getattr(picture, name) for picture in pictures]) for name in FIELDS))
 
+    backend = pytest.importorskip("primdiffusion.render.cuda.march")
     boxes, cameras = people(0, 1), views(3)
     scenes = [
         (boxes.map(lambda tensor: tensor[:, None]), cameras, (6, 6)),
@@ -158,7 +159,7 @@ def test_on_cuda_devices_a_batch_is_one_call_and_one_person_is_not_copied(settin
     ]
     expected = [march(person, view, settings) for person, view, _ in scenes]
     monkeypatch.setattr(cuda, "available", lambda device: True)
-    monkeypatch.setattr(cuda, "march_cuda", march_cuda)
+    monkeypatch.setattr(backend, "march_cuda", march_cuda)
     for (person, view, sizes), pictures in zip(scenes, expected, strict=True):
         got = march(person, view, settings)
         assert calls[-1] == (*sizes, None)

@@ -11,9 +11,10 @@ from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.capture_layout import picture_path
+from primdiffusion.formats.requests import EncodeSettings
 from primdiffusion.people.stored_people import PersonFolder, read_person
 from primdiffusion.primitives.primitives import K, S
-from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
+from primdiffusion.training.captured_people import encode_people, frames_of_looks, read_cards
 from support.errors import refused
 from support.tiny import save_tiny_encoder, tiny_encoder
 

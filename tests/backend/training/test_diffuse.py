@@ -24,7 +24,7 @@ from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
 from primdiffusion.training import diffusion_task
 from primdiffusion.training.cells import CellTask, prepare
-from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
+from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.diffusion_task import SlabTask
 from primdiffusion.training.loop import Interrupt, Step, step_seed
@@ -43,7 +43,7 @@ make_small(pytest.MonkeyPatch())
 whole, saves = Path.write_bytes, []
 
 def write(path, content):
-    if ".state" in path.name:
+    if "state" in path.name:
         saves.append(path)
         if len(saves) == 5:
             whole(path, content[: len(content) // 2])
@@ -74,25 +74,25 @@ def after(steps):
     return lambda self: asked.append(0) or len(asked) > steps
 
 
-def first_step(phase):
-    return Step(phase, 0, torch.Generator().manual_seed(0), {})
+def first_step():
+    return Step(0, torch.Generator().manual_seed(0), {})
 
 
 def test_a_run_leaves_settings_people_metrics_pictures_states_and_a_model(people, whole):
     assert {path.name for path in whole.iterdir()} == DEFAULT_FILES
-    assert json.loads((whole / "config.json").read_text())["person"]["steps"] == 6
+    assert json.loads((whole / "config.json").read_text())["local"]["steps"] == 10
     about = json.loads((whole / "run.json").read_text())
     assert about["people"] == [path.stem for path in sorted(people.iterdir())]
     assert len(about["held"]) == 3
     (start,) = about["starts"]
-    assert (start["steps"], start["processes"]) == ({}, 1)
+    assert (start["step"], start["processes"]) == (0, 1)
     assert start.keys() >= {"torch", "accelerate", "python", "primdiffusion"}
-    assert logged(whole) == [("person", step) for step in range(1, 7)] + [("local", step) for step in range(1, 5)]
+    assert logged(whole) == list(range(1, 11))
     measured = [row for row in rows(whole) if "rms_500" in row]
-    assert [(row["phase"], row["step"]) for row in measured] == [("person", 6), ("local", 4)]
+    assert [row["step"] for row in measured] == [5, 10]
     assert all(np.isfinite(row["rms_500"]) for row in measured)
     pictures = sorted(path.name for path in (whole / "pictures").iterdir())
-    assert pictures == ["local_0000004.png", "person_0000006.png"]
+    assert pictures == ["0000010.png"]
     assert Image.open(whole / "pictures" / pictures[0]).size == (24, 40)
 
 
@@ -101,7 +101,7 @@ def test_the_card_tells_data_settings_and_errors(whole):
     errors = card["held_out_rms_x0_error"]
     assert errors.keys() == {"gaussian", "mixture", "denoiser"}
     assert {int(level) for level in errors["gaussian"]} == set(LEVELS)
-    assert card["steps"] == {"person": 6, "local": 4}
+    assert card["steps"] == {"local": 10}
     assert (card["geometries"], card["people"], card["held_out_geometries"]) == (13, 39, 3)
     assert card["licence"] == "CC0-1.0"
     assert "4 of 2051 numbers" in " ".join(card["limits"])
@@ -119,28 +119,28 @@ def test_the_distance_on_the_card_is_that_of_the_heads_voxels():
 def test_a_card_claims_nothing_of_people_it_does_not_know(people, run):
     card = train(settings(people, run, minutes=0.0)).card
     assert not card.keys() & {"licence", "data", "limits"}
-    assert card["steps"] == {"person": 0, "local": 0}
+    assert card["steps"] == {"local": 0}
 
 
 def test_a_run_in_parts_is_bit_identical_to_one_in_one_go(people, whole, run, monkeypatch):
     due = Interrupt.due
-    for last in (2, 3, 4, 1):  # steps done before it is asked to stop: within, between and before phases
+    for last in (2, 3, 4, 1):  # steps done before it is asked to stop
         asked = []
         monkeypatch.setattr(Interrupt, "due", lambda self, last=last, asked=asked: asked.append(0) or len(asked) > last)
         train(settings(people, run))
         torch.randn(3)  # whatever else is drawn in between does not matter
     monkeypatch.setattr(Interrupt, "due", due)
     train(settings(people, run))
-    for name in ("person.state.safetensors", "local.state.safetensors", MODEL):
+    for name in ("state.safetensors", MODEL):
         assert same_tensors(run / name, whole / name), name
     assert timeless(run) == timeless(whole)
-    starts = [start["steps"] for start in json.loads((run / "run.json").read_text())["starts"]]
-    assert starts[:2] == [{}, {"person": 2}]
+    starts = [start["step"] for start in json.loads((run / "run.json").read_text())["starts"]]
+    assert starts == [0, 2, 5, 9, 10]
 
 
 def test_a_new_run_starts_from_a_checkpoints_closed_form_and_weights(people, whole, tmp_path):
     base = load_checkpoint(whole / MODEL)
-    config = settings(people, tmp_path / "run", start_from=whole / MODEL, person=PhaseConfig(steps=1, batch=4))
+    config = settings(people, tmp_path / "run", start_from=whole / MODEL, local=NetworkTraining(steps=1, batch=4))
     folder = PersonFolder(people)
     task = CellTask(config, prepare(config, folder, [0, 1], [2], base), torch.device("cpu"), base)
     for name, value in task.denoiser.state_dict().items():
@@ -176,14 +176,14 @@ def test_a_kill_in_the_middle_of_a_save_loses_one_interval(people, whole, run):
         env=child_environment(), capture_output=True, timeout=500, check=False,
     )  # fmt: skip
     assert died.returncode == -signal.SIGKILL
-    assert logged(run) == [("person", step) for step in range(1, 6)]
+    assert logged(run) == list(range(1, 6))
     assert len(list(run.glob(".*.partial*"))) == 1
     with (run / "metrics.jsonl").open("a") as file:
-        file.write('{"phase": "person", "step": 6, "lo')
+        file.write('{"step": 6, "lo')
     train(settings(people, run))
     assert {path.name for path in run.iterdir()} == DEFAULT_FILES
     assert same_tensors(run / MODEL, whole / MODEL)
-    assert same_tensors(run / "person.state.safetensors", whole / "person.state.safetensors")
+    assert same_tensors(run / "state.safetensors", whole / "state.safetensors")
     assert timeless(run) == timeless(whole)
 
 
@@ -193,12 +193,12 @@ def test_other_people_or_settings_in_the_same_folder_are_rejected(people, few, r
         train(settings(few, run))
     with refused(ValueError, "default"):
         train(settings(people, run, preset="paper"))
-    slower = PhaseConfig(steps=6, batch=16, learning_rate=1e-5)
-    with refused(ValueError, "person.learning_rate"):
-        train(settings(people, run, person=slower))
+    slower = NetworkTraining(steps=10, batch=4, learning_rate=1e-5)
+    with refused(ValueError, "local.learning_rate"):
+        train(settings(people, run, local=slower))
 
 
-@pytest.mark.parametrize("name", ["config.json", "run.json", "prepared.safetensors", "person.state.safetensors"])
+@pytest.mark.parametrize("name", ["config.json", "run.json", "prepared.safetensors", "state.safetensors"])
 def test_a_damaged_file_of_the_run_is_named(people, whole, tmp_path, name):
     shutil.copytree(whole, tmp_path / "run")
     path = tmp_path / "run" / name
@@ -214,12 +214,12 @@ def test_memory_that_runs_out_names_a_batch_to_try(people, run, monkeypatch):
         raise RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 99 bytes")
 
     monkeypatch.setattr(CellTask, "loss", greedy)
-    with refused(ValueError, "--person.batch 8"):
+    with refused(ValueError, "--local.batch 2"):
         train(settings(people, run))
 
 
-def test_steps_draw_other_numbers_on_every_process_and_in_every_phase():
-    places = itertools.product((0, 1), ("person", "slab"), range(50), range(3))
+def test_steps_draw_other_numbers_on_every_process_and_for_every_network():
+    places = itertools.product((0, 1), ("local", "slab"), range(50), range(3))
     seeds = {step_seed(*place) for place in places}
     assert len(seeds) == 600
     assert all(0 <= seed < 2**63 for seed in seeds)
@@ -236,8 +236,8 @@ def paper(few, tmp_path_factory):
 
 
 def test_the_paper_preset_trains_saves_loads_and_generates(paper):
-    assert logged(paper) == [("slab", 1), ("slab", 2)]
-    assert [path.name for path in (paper / "pictures").iterdir()] == ["slab_0000002.png"]
+    assert logged(paper) == [1, 2]
+    assert [path.name for path in (paper / "pictures").iterdir()] == ["0000002.png"]
     model = load_checkpoint(paper / MODEL)
     assert model.denoiser.config == TINY_UNET
     assert model.card["preset"] == "paper"
@@ -253,7 +253,7 @@ def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path, monkeypatch)
         patch.setattr(Interrupt, "due", after(1))
         train(settings(few, tmp_path / "run", preset="paper"))
     train(settings(few, tmp_path / "run", preset="paper"))
-    for name in ("slab.state.safetensors", MODEL):
+    for name in ("state.safetensors", MODEL):
         assert same_tensors(tmp_path / "run" / name, paper / name)
 
 
@@ -270,17 +270,17 @@ def test_the_paper_preset_learns_slabs_of_the_people(few):
 
 def test_an_untrained_paper_network_has_the_loss_of_guessing_nothing(few):
     # it starts at 0, so the plain error is the mean square of the slabs themselves, at any level
-    config = settings(few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=2))
+    config = settings(few, Path("unused"), preset="paper", slab=NetworkTraining(steps=1, batch=2))
     task = SlabTask(config, PersonFolder(few), [0], [1], torch.device("cpu"))
     energy = task.slabs([(0, 0)]).square().mean().item(), task.slabs([(0, 1)]).square().mean().item()
-    loss = task.loss(first_step("slab"))["loss"].item()
+    loss = task.loss(first_step())["loss"].item()
     assert min(energy) - 1e-6 <= loss <= max(energy) + 1e-6
 
 
 @pytest.mark.parametrize(("fast", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypatch, fast, dtype):
     monkeypatch.setattr(diffusion_task, "has_fast_bfloat16", lambda device: fast)
-    config = settings(few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, bfloat16=True))
+    config = settings(few, Path("unused"), preset="paper", slab=NetworkTraining(steps=1, batch=1, bfloat16=True))
     task = SlabTask(config, PersonFolder(few), [0], [1], torch.device("cpu"))
     seen, layer = [], torch.nn.Conv2d(56, 56, 1)  # processors are slow at convolutions in bfloat16
 
@@ -289,7 +289,7 @@ def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypat
         return out
 
     task.denoiser = network
-    loss = task.loss(first_step("slab"))["loss"]
+    loss = task.loss(first_step())["loss"]
     assert seen == [dtype]
     assert loss.dtype == torch.float32
 
@@ -297,18 +297,18 @@ def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypat
 @pytest.mark.parametrize(
     ("settings_of", "changes", "word"),
     [
-        (PhaseConfig, {"steps": 0}, "steps is 0"),
-        (PhaseConfig, {"batch": 0}, "batch is 0"),
-        (PhaseConfig, {"learning_rate": 0.0}, "learning_rate"),
-        (PhaseConfig, {"ema": 1.0}, "ema"),
-        (PhaseConfig, {"blend": 1.5}, "blend"),
+        (NetworkTraining, {"steps": 0}, "steps is 0"),
+        (NetworkTraining, {"batch": 0}, "batch is 0"),
+        (NetworkTraining, {"learning_rate": 0.0}, "learning_rate"),
+        (NetworkTraining, {"ema": 1.0}, "ema"),
+        (NetworkTraining, {"blend": 1.5}, "blend"),
         (TrainingConfig, {"holdout": 1.0}, "holdout"),
         (TrainingConfig, {"minutes": -1.0}, "minutes"),
         (TrainingConfig, {"log_every": 0}, "log_every"),
     ],
 )
 def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
-    given = {"steps": 1, "batch": 1} if settings_of is PhaseConfig else {"data": Path("a"), "run": Path("b")}
+    given = {"steps": 1, "batch": 1} if settings_of is NetworkTraining else {"data": Path("a"), "run": Path("b")}
     with pytest.raises(ValueError, match=word):
         settings_of(**{**given, **changes})
 

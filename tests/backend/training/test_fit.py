@@ -21,7 +21,7 @@ from primdiffusion.training.fit import MODEL, EncoderTask, fit, run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
 from primdiffusion.training.fit_data import fit_batches
 from primdiffusion.training.fit_losses import volume_loss
-from primdiffusion.training.loop import begin_phase
+from primdiffusion.training.loop import begin_training
 from primdiffusion.training.run_folder import METRICS, PICTURES, Metrics
 from safetensors.torch import load_file
 from support.errors import refused
@@ -230,7 +230,7 @@ def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tm
     for hold_scale in (1, 0):
         config = settings(captures, tmp_path / "run", hold_scale=hold_scale)
         task = first_task(config)
-        state = begin_phase(task, "", task.accelerator)
+        state = begin_training(task, task.accelerator)
         sample, _ = next(fit_batches(task.dataset, config, FIRST, SINGLE_PROCESS))
         with torch.no_grad():
             state.network.scale_out.bias.fill_(30.0)  # as if boxes had learned to be larger
@@ -243,7 +243,7 @@ def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tm
 def test_biases_of_places_learn_so_many_times_as_fast_as_weights(captures, tmp_path):
     config = settings(captures, tmp_path / "run", place_rate=50.0)
     task = first_task(config)
-    state = begin_phase(task, "", task.accelerator)
+    state = begin_training(task, task.accelerator)
     before = {name: value.detach().clone() for name, value in state.network.named_parameters()}
     state.update(sum(value.sum() for value in state.network.parameters()))
     after = {name: value.detach() for name, value in state.network.named_parameters()}

@@ -8,7 +8,7 @@ import torch
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.schedule import fine_linear, linear
 from primdiffusion.training.cells import CellTask
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import (
     BLURRED_FROM,
@@ -30,10 +30,10 @@ def latent_set(geometry, detailed):
 
 
 def test_a_network_that_knows_more_has_less_error(prepared_once):
-    from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+    from primdiffusion.diffusion.denoiser import PersonDenoiser
 
     _, prepared = prepared_once
-    denoiser = PersonDenoiser(DenoiserConfig(None, None), prepared.prior, linear())
+    denoiser = PersonDenoiser(None, prepared.prior, linear())
     guesses = {
         "nothing": lambda x, t: prepared.prior.mean.expand_as(x),
         "gaussian": closed_form(denoiser, single=True),
@@ -51,7 +51,7 @@ def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
         schedule,
         20_000,
         torch.Generator().manual_seed(0),
-        PhaseConfig(steps=1, batch=1, levels="log_normal"),
+        NetworkTraining(steps=1, batch=1, levels="log_normal"),
         spread=0.05,
     )
     clean, noise = schedule.levels(t, torch.empty(0, 1))
@@ -97,15 +97,14 @@ def test_errors_count_by_the_deviation_of_the_closed_form_with_mean_one_at_every
     assert weighted_error(torch.tensor([[0.0, 1.0]]), wide).item() == pytest.approx(0.75, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["person", "local"])
-def test_both_networks_learn(prepared_once, name):
+def test_the_network_learns(prepared_once):
     config, prepared = prepared_once
     task = CellTask(config, prepared, torch.device("cpu"))
-    task.network(name).requires_grad_(True)
-    loss = task.objective(name).loss(torch.Generator().manual_seed(0))
+    task.network().requires_grad_(True)
+    loss = task.objective.loss(torch.Generator().manual_seed(0))
     loss.backward()
     assert torch.isfinite(loss)
-    assert task.network(name).outer.weight.grad.abs().max() > 0
+    assert task.network().outer.weight.grad.abs().max() > 0
 
 
 def test_blends_are_asked_for_by_what_both_people_have():

@@ -3,9 +3,9 @@
 import pytest
 import torch
 from primdiffusion.training import diffusion_task
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.diffusion_task import DiffusionTask
-from primdiffusion.training.loop import begin_phase
+from primdiffusion.training.loop import begin_training
 from primdiffusion.training.state import accelerator_of
 from support.errors import refused
 from torch import nn
@@ -25,19 +25,21 @@ class Net(nn.Module):
 class NetTask(DiffusionTask):
     """As much of a task as a state needs."""
 
+    name = "net"
+
     def __init__(self, memory_format, **settings):
         torch.manual_seed(3)
         self.net, self.device = Net().to(memory_format=memory_format), torch.device("cpu")
-        self.config = PhaseConfig(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
+        self.config = NetworkTraining(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
 
     @property
-    def phases(self):
-        return {"net": self.config}
+    def settings(self):
+        return self.config
 
-    def network(self, phase):
+    def network(self):
         return self.net
 
-    def put(self, phase, network):
+    def put(self, network):
         self.net = network
 
     def loss(self, step): ...
@@ -54,7 +56,7 @@ def fast(monkeypatch):
 
 
 def started(memory_format=torch.channels_last, **settings):
-    return begin_phase(NetTask(memory_format, **settings), "net", accelerator_of())
+    return begin_training(NetTask(memory_format, **settings), accelerator_of())
 
 
 def advance(state, steps):

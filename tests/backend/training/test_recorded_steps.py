@@ -11,17 +11,17 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.training import diffusion_task
 from primdiffusion.training.cells import CellTask
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.diffuse import MODEL, train
 from primdiffusion.training.loop import Interrupt
 from primdiffusion.training.muon import MuonAdamW
+from primdiffusion.training.run_folder import STATE
 from support import graphs
 from support.runs import same_tensors
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-PERSON, LOCAL = 6, 4
-"""Steps, of a network with dropout and of one with Muon."""
+STEPS = 8
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def trained(people, whole, tmp_path_factory):
         return go_on(run)
 
     def go_on(run):
-        muon = PhaseConfig(steps=LOCAL, batch=4, evaluate_every=2, optimiser="muon", weight_decay=0.1)
+        muon = NetworkTraining(steps=STEPS, batch=4, evaluate_every=2, optimiser="muon", weight_decay=0.1)
         train(settings(people, run, local=muon))
         return run
 
@@ -47,26 +47,26 @@ def trained(people, whole, tmp_path_factory):
 
 
 def assert_same(run, plain):
-    for name in ("person.state.safetensors", "local.state.safetensors", MODEL):
+    for name in (STATE, MODEL):
         assert same_tensors(run / name, plain / name), name
 
 
 def test_recorded_steps_train_the_same_bits_as_steps_launched_one_by_one(trained, monkeypatch):
     found = graphs.on_processors(monkeypatch)
     assert_same(trained(), trained.plain)
-    # each network's loss and gradients, and Muon's changes; the first call of each is launched, as Triton compiles then
-    assert [graph.replays for graph in found] == [PERSON - 1, LOCAL - 1, LOCAL - 1]
+    # loss and gradients, and Muon's changes; the first call of each is launched, as Triton compiles then
+    assert [graph.replays for graph in found] == [STEPS - 1, STEPS - 1]
 
 
 def test_a_recorded_run_in_parts_is_bit_identical_to_one_in_one_go(trained, monkeypatch):
     graphs.on_processors(monkeypatch)
     with monkeypatch.context() as patch:
         asked = []
-        patch.setattr(Interrupt, "due", lambda self: asked.append(0) or len(asked) in (4, 5, 10))
+        patch.setattr(Interrupt, "due", lambda self: asked.append(0) or len(asked) in (3, 6))
         run = trained()
         trained.go_on(run)
     assert_same(trained.go_on(run), trained.plain)
-    assert len(asked) >= 10
+    assert len(asked) == 6
 
 
 def test_what_cannot_be_recorded_is_launched_from_python_and_said_once(trained, monkeypatch, caplog):
@@ -77,7 +77,7 @@ def test_what_cannot_be_recorded_is_launched_from_python_and_said_once(trained, 
 
     monkeypatch.setattr(cuda_graph, "record", record)
     assert_same(trained(), trained.plain)
-    assert caplog.text.count("cannot be recorded: operation not permitted") == 3
+    assert caplog.text.count("cannot be recorded: operation not permitted") == 2
 
 
 def test_several_processes_exchange_gradients_in_the_backward_pass_so_nothing_is_recorded(monkeypatch):
@@ -102,12 +102,11 @@ class WithoutCopies(TorchDispatchMode):
         return found
 
 
-@pytest.mark.parametrize("phase", ["person", "local"])
-def test_what_is_recorded_neither_reads_from_the_device_nor_copies_to_it(prepared_once, monkeypatch, phase):
+def test_what_is_recorded_neither_reads_from_the_device_nor_copies_to_it(prepared_once, monkeypatch):
     """On a device without data, where reading is an error."""
     config, prepared = prepared_once
     task = CellTask(config, prepared, torch.device("cpu"))
-    batch = [tensor.to("meta") for tensor in task.objective(phase).batch(torch.Generator().manual_seed(0))]
+    batch = [tensor.to("meta") for tensor in task.objective.batch(torch.Generator().manual_seed(0))]
     monkeypatch.setattr(
         PersonDenoiser, "_precision", lambda *_: contextlib.nullcontext()
     )  # autocast knows no such device
@@ -116,9 +115,9 @@ def test_what_is_recorded_neither_reads_from_the_device_nor_copies_to_it(prepare
     )  # read by the first call
     for shape in ((1, 1), (1, 1, 1, 1)):
         task.denoiser.schedule.levels(batch[2], torch.empty(shape, device="meta"))
-    network = task.denoiser.to("meta").requires_grad_(True).get_submodule(phase)
+    network = task.denoiser.to("meta").requires_grad_(True).get_submodule("local")
     muon = MuonAdamW(network, 1e-3, 0.0)
-    recorded = cuda_graph.RecordedLoss(task.objective(phase).error, network)
+    recorded = cuda_graph.RecordedLoss(task.objective.error, network)
     with WithoutCopies():
         _, *gradients = recorded._with_gradients(*batch)
         hidden = muon.param_groups[0]["params"]

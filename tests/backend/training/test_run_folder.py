@@ -12,7 +12,7 @@ from diffuse_runs import make_small, settings
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.runtime.failures import MissingPackageError
 from primdiffusion.runtime.worker_process import lock_folder
-from primdiffusion.training.config import PhaseConfig, TrainingConfig, check_resumable, to_json
+from primdiffusion.training.config import NetworkTraining, TrainingConfig, check_resumable, to_json
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig
@@ -20,7 +20,7 @@ from primdiffusion.training.run_folder import open_metrics
 from support.errors import refused
 from support.runs import rows
 
-FEW = {"person": PhaseConfig(steps=2, batch=4, evaluate_every=2), "local": PhaseConfig(steps=1, batch=1)}
+FEW = {"local": NetworkTraining(steps=2, batch=2, evaluate_every=2)}
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ class Wandb(types.ModuleType):
         self.finished = True
 
 
-def test_tensorboard_gets_every_number_of_every_phase(people, run, monkeypatch):
+def test_tensorboard_gets_every_number(people, run, monkeypatch):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -86,12 +86,10 @@ def test_tensorboard_gets_every_number_of_every_phase(people, run, monkeypatch):
     config = settings(people, run, tracker="tensorboard", **FEW)
     train(config)
     events = EventAccumulator(str(config.run / "tensorboard"), size_guidance={"scalars": 0}).Reload()
-    offset = {"person": 0, "local": config.person.steps}
     for row in rows(config.run):
-        phase = row.pop("phase")
         for name, value in row.items():
-            sent = {event.step: event.value for event in events.Scalars(f"{phase}/{name}")}
-            assert sent[offset[phase] + row["step"]] == pytest.approx(value, rel=1e-5)
+            sent = {event.step: event.value for event in events.Scalars(name)}
+            assert sent[row["step"]] == pytest.approx(value, rel=1e-5)
 
 
 def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, run, monkeypatch):
@@ -105,15 +103,15 @@ def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, run, mo
     steps = [step for step, _ in wandb.lines]
     assert steps == sorted(steps)
     assert len(wandb.lines) == len(rows(config.run))
-    assert any("local/loss" in values for _, values in wandb.lines)
+    assert any("loss" in values for _, values in wandb.lines)
 
 
-def test_lines_without_a_phase_are_sent_too(tmp_path, monkeypatch):
+def test_lines_are_sent_as_they_are_written(tmp_path, monkeypatch):
     PartialState()  # as a run has, and as tests before this one may have: trackers log through it
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     with open_metrics(settings(tmp_path, tmp_path, tracker="wandb")) as metrics:
-        metrics.append({"step": 3, "loss": 0.5}, 3)
+        metrics.append({"step": 3, "loss": 0.5})
     assert wandb.lines == [(3, {"step": 3, "loss": 0.5})]
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from primdiffusion.files import tensor_file
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.state import TrainingState, accelerator_of, learning_rate_factor
 from support.errors import refused
 
@@ -11,7 +11,7 @@ from support.errors import refused
 def state_of_a_line():
     torch.manual_seed(3)
     network = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
-    return TrainingState(network, PhaseConfig(steps=50, batch=4), accelerator_of())
+    return TrainingState(network, NetworkTraining(steps=50, batch=4), accelerator_of())
 
 
 def advance(state, steps):
@@ -46,7 +46,7 @@ def test_the_average_lags_behind_the_weights():
 
 def test_a_state_of_another_network_is_rejected(tmp_path):
     state = state_of_a_line()
-    other = TrainingState(torch.nn.Linear(2, 2), PhaseConfig(steps=1, batch=1), accelerator_of())
+    other = TrainingState(torch.nn.Linear(2, 2), NetworkTraining(steps=1, batch=1), accelerator_of())
     state.save(tmp_path / "state")
     with pytest.raises(ValueError, match="does not fit"):
         other.load(tmp_path / "state")

@@ -1,13 +1,11 @@
-"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, trackers, SAM 3D Body; and the writer
-of AMASS.
+"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, trackers; and the writer of AMASS.
 
 Arrays in a tracker's output may be one level down, or divided by frames:
 
 - GVHMR: `smpl_params_global`, beside the same in a camera's axes;
 - WHAM, VIBE: a person's arrays by the person's number; `pose_world` and `trans_world` rather than a camera's;
 - PHALP, 4D-Humans' track.py: frames by the picture's name, with the numbers of the people in it (`tid`) and their
-  `smpl`, in a camera's axes;
-- SAM 3D Body: a list of people.
+  `smpl`, in a camera's axes.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ from ...files.json_files import read_json
 from ...files.regular_files import FileError, read_regular
 from ...files.smpl_pickle import Inert, as_array, load_restricted
 from ...files.whole_files import replacing
-from . import mhr
 from .bvh import read_bvh
 from .motion import (
     DEFAULT_FPS,
@@ -60,8 +57,7 @@ _ROOT, _REST = ("global_orient", "root_orient"), ("body_pose", "pose_body")
 _TRANSLATIONS = ("trans_world", "trans", "transl", "translation")
 POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *RATES)
 """Names of arrays in pose files."""
-_KEYS = tuple(dict.fromkeys((*POSE_KEYS, *mhr.KEYS)))
-_HOLDING = (*_POSES, *_REST, *mhr.POSES)
+_HOLDING = (*_POSES, *_REST)
 """Arrays of which a person has at least one."""
 ENDINGS = (".npz", ".npy", ".json", ".pkl", ".bvh")
 """Of the files that are read."""
@@ -87,7 +83,6 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
     - .pkl: a dictionary of such arrays, as estimators of SMPL write it, joblib too; nothing in it is run
       (`smpl_pickle`).
     - .pkl and .json of trackers, of several people or frame by frame: see `people`.
-    - .npz, .json and .pkl of SAM 3D Body: see `mhr`.
     - .bvh: any rig that `rigs` knows.
 
     Without a frame rate it is `DEFAULT_FPS`. Raises FileError where there is no such file, or it
@@ -113,7 +108,7 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
             if lengths:
                 detected = dataclasses.replace(motion.detected, people=tuple(lengths))
                 motion = dataclasses.replace(motion, detected=detected)
-                expected = "" if mhr.holds_some(arrays) else "y"
+                expected = "y"
         else:
             arrays = _read_npz(path) if suffix == ".npz" else {"pose": read_npy(path)}
             motion = motion_from_arrays(arrays, path)
@@ -126,13 +121,8 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
-    """The motion of arrays of a file, axes unchanged. Raises FileError, and OSError where there is no such file.
-
-    Their names are `POSE_KEYS` or `mhr.KEYS`.
-    """
+    """The motion of a file's arrays, named as in `POSE_KEYS`, axes unchanged. Raises FileError, and OSError."""
     check_motion_size(path, max((array.size for array in arrays.values()), default=0))
-    if mhr.ROTATIONS in arrays or (mhr.holds_some(arrays) and not _holds_smpl(arrays)):
-        return mhr.motion_of(arrays, path)
     return motion_from_numbers(arrays, str(path))
 
 
@@ -175,13 +165,13 @@ def motion_from_numbers(content: Any, name: str) -> Motion:
 
 
 def _holds_smpl(arrays: Mapping[str, NDArray]) -> bool:
-    return any(key in arrays for key in (*_POSES, *_REST))
+    return any(key in arrays for key in _HOLDING)
 
 
 def _read_npz(path: Path) -> dict[str, NDArray]:
     names = array_names(path)
-    arrays = read_arrays(path, optional=_KEYS)
-    if not (_holds_smpl(arrays) or mhr.holds_some(arrays)):
+    arrays = read_arrays(path, optional=POSE_KEYS)
+    if not _holds_smpl(arrays):
         if "smpl" in names:
             raise FileError(path, "holds pickled objects, which are never read", "use the version with plain arrays")
         remedy = "give a file with 'poses', or with 'global_orient' and 'body_pose'"
@@ -237,7 +227,7 @@ def _arrays(content: Any, name: str) -> dict[str, NDArray]:
     try:
         return {
             key: as_array(content[key]) if isinstance(content[key], Inert) else np.asarray(content[key])
-            for key in _KEYS
+            for key in POSE_KEYS
             if key in content
         }
     except (ValueError, TypeError, OverflowError) as e:

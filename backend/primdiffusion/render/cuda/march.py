@@ -1,13 +1,12 @@
 """The fast marcher for CUDA devices: Triton kernels, float32, batched, with a hand-written adjoint (SPEC 4).
 
-The same rule as `reference.py`. Triton compiles the kernels on first use and caches them on disk; it is imported only
-then, so that this module loads without it. `cuda_scene` launches the forward pass, and `marcher` repeats it as graphs.
+The same rule as `reference.py`. Triton compiles the kernels on first use and caches them on disk. `scene` launches the
+forward pass, and `marcher` repeats it as graphs.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib.util
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
+from primdiffusion.render.cuda import triton_adjoint
 from primdiffusion.render.cuda.marcher import prepared
 from primdiffusion.render.cuda.scene import BOX_FIELDS, Packed, Picture, Scene, Shapes, check, launch
 from primdiffusion.render.image import Rendering
@@ -26,18 +26,6 @@ from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
 LANES_OF_SEEDS = 256
 """Rays per program of `seed_rays`."""
-
-
-def available(device: torch.device | str = "cuda") -> bool:
-    """Whether `march_cuda` can run on `device`, which requires CUDA and Triton."""
-    return torch.device(device).type == "cuda" and importlib.util.find_spec("triton") is not None
-
-
-def suits(primitives: Primitives, camera: Camera) -> bool:
-    """Whether `march_cuda` supports the scene: float32, voxels of 8^3."""
-    tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
-    single = all(tensor.dtype == torch.float32 for tensor in tensors)
-    return single and primitives.density.shape[-3:] == (S, S, S)
 
 
 def march_cuda(
@@ -58,15 +46,9 @@ def march_cuda(
     40 bytes per pixel, and during the backward pass another 32 per pixel and 8 KB for every 512 pixels of a box (for
     more pixels in larger images). In index order 40 bytes per pixel even without gradients, and lists twice.
 
-    Raises ValueError as `check_scene` does, for voxels other than 8^3 and dtypes other than float32; ImportError
-    without Triton.
+    Raises ValueError as `check_scene` does, for voxels other than 8^3 and dtypes other than float32.
     """
     check(primitives, camera, span)
-    if importlib.util.find_spec("triton") is None:
-        raise ImportError(
-            "march_cuda needs Triton, which is not installed: install the version of triton that your torch requires "
-            "(`pip show torch`), or call march_reference"
-        )
     tensors = [getattr(primitives, name) for name in BOX_FIELDS] + [camera.intrinsics, camera.world_to_camera]
     keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     device = primitives.position.device
@@ -130,9 +112,6 @@ def _adjoint(
     `units` may be more than the boxes have, in a recording; where they are too few, the result is of no use, as every
     repetition of the recording looks for (see `cuda_scene.drawn`).
     """
-    # triton is optional
-    from primdiffusion.render.cuda import triton_adjoint
-
     position, rotation, half_extent, intrinsics, world_to_camera, record, indices, voxels, reach, kept, ends = saved
     height, width = on_alpha.shape[1:]
     (p, k), b, device = position.shape[:2], len(intrinsics), position.device

@@ -22,6 +22,7 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
 from primdiffusion.render.cuda import graph as cuda_graph
+from primdiffusion.render.cuda import triton_boxes, triton_lists, triton_march
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
 LIST_LIMIT = 1 << 24
@@ -163,9 +164,6 @@ class Packed(NamedTuple):
 
     def pack(self, rgb: Tensor, density: Tensor) -> Packed:
         """Fill with these contents, and return self."""
-        # triton is optional
-        from primdiffusion.render.cuda import triton_boxes
-
         launch(triton_boxes.pack_boxes, (self.bounds[..., 0].numel(),), rgb, density, *self, num_warps=4)
         return self
 
@@ -238,9 +236,6 @@ def _lattice(spacing: float, thresholds: tuple[float, ...], device: torch.device
 
 def place(scene: Scene, packed: Packed, geometry: list[Tensor], intrinsics: Tensor, world_to_camera: Tensor) -> Placed:
     """Place the boxes, whose position, rotation and half extent are `geometry`, as each view sees them."""
-    # triton is optional
-    from primdiffusion.render.cuda import triton_boxes, triton_lists
-
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     (p, k), b, device = geometry[0].shape[:2], len(intrinsics), intrinsics.device
     totals = torch.zeros(triton_boxes.TOTALS, dtype=torch.int64, device=device)
@@ -306,9 +301,6 @@ def march_constants(shapes: Shapes, sets: int, gap: int) -> dict[str, int]:
 
 def draw(scene: Scene, packed: Packed, placed: Placed, picture: Picture, plan: Plan) -> Kept:
     """List the boxes by tile and march; writes `picture`."""
-    # triton is optional
-    from primdiffusion.render.cuda import triton_march
-
     shapes, (b, height, width), device = scene.shapes, picture[1].shape, picture[1].device
     (p, k), keep = packed.bounds.shape[:2], scene.keep or scene.index_order
     kept = torch.empty((b, height, width, 8) if keep else 0, device=device)
@@ -337,9 +329,6 @@ def draw(scene: Scene, packed: Packed, placed: Placed, picture: Picture, plan: P
 
 def _list(scene: Scene, plan: Plan, placed: Placed, order: Int[Tensor, "b k"]) -> _Lists:
     """List the boxes of each tile, or bin, in `order`; a list may be cut short where the plan does not fit."""
-    # triton is optional
-    from primdiffusion.render.cuda import triton_lists
-
     (b, k), device = order.shape, order.device
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     across, down = -(-width // shapes.tile[0]), -(-height // shapes.tile[1])
