@@ -216,7 +216,7 @@ def test_metrics_that_find_no_room_name_their_file(captures, tmp_path):
     config = settings(captures, tmp_path / "run")
     (config.run / METRICS).mkdir(parents=True)
     with pytest.raises(OSError) as error:
-        Metrics(config.run).append({"step": 1}, 1)
+        Metrics(config.run).append({"step": 1})
     assert str(config.run / METRICS) in sentence(error.value)
 
 
