@@ -35,7 +35,7 @@ class Surfaces(TensorRecord):
     cell: Int[Tensor, "n"]
     """The box."""
     share: Float[Tensor, "n 512"]
-    """How much of a voxel's colour is that of the surface, 0 ... 1."""
+    """How much of a voxel's colour is that of the surface, 0 ... 1, where no later one covers it."""
     tone: Float[Tensor, "n 512"]
     """The voxel's sRGB-encoded colour as a multiple of the surface's."""
     read: Bool[Tensor, "n"]
@@ -49,7 +49,7 @@ class Surfaces(TensorRecord):
         missing = self.condition.sum(1) - kind @ self.condition.T
         for person, its in enumerate(missing < 0.5):
             surfaces = its.nonzero()[:, 0].tolist()
-            covered = torch.zeros(len(cells[person]), S**3)
+            covered = cells.new_zeros(cells.shape[1], S**3)
             colours = {}
             for surface in reversed(surfaces):
                 own = self.surface == surface

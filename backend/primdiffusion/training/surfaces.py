@@ -149,7 +149,7 @@ class _People:
         meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
         everywhere = torch.ones_like(skin)
         for part, border in zip(parts, self.borders(own, parts, meet), strict=True):
-            drawn = everywhere if part is not parts[0] else ~everywhere
+            drawn = torch.full_like(skin, part is not parts[0])  # the face, where skin is read, keeps its colours
             whole = self.rows(own, part, read=everywhere, drawn=drawn)
             found.append((row, _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))))
         return found

@@ -72,6 +72,8 @@ def dressed(hair, colours, generator, patterned=False, cap=False, suit=False):
     voxels[region_of(TOP), :, :3] = colours["tee"]
     voxels[region_of(CUFFS), :, :3] *= CUFF
     voxels[region_of(COLLAR), OUTER, :3] = colours["tee"]
+    feet = region_of(("feet",))  # socks of the tee's colour, darker or brighter on everybody: no border of surfaces
+    voxels[feet, :, :3] = (0.8 + 0.4 * torch.rand(int(feet.sum()), 1, 1, generator=generator)) * colours["tee"]
     if suit:
         voxels[region_of((*TOP, "hips", "thighs")), :, :3] = colours["tee"]
     if patterned:
