@@ -359,11 +359,13 @@ def _is_halved(key: str, value: Tensor) -> bool:
 
 BYTE = 255.0
 """A stored share of 1, or the largest tone."""
+_OF_VOXELS = {"share": 1.0, "tone": BRIGHTEST, "second": 1.0}
+"""Fields of surfaces that are stored in bytes, and their largest values."""
 
 
 def store_surfaces(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Surfaces with shares and tones in bytes."""
-    in_bytes = {"surfaces.share": tensors["surfaces.share"], "surfaces.tone": tensors["surfaces.tone"] / BRIGHTEST}
+    in_bytes = {f"surfaces.{name}": tensors[f"surfaces.{name}"] / most for name, most in _OF_VOXELS.items()}
     return tensors | {key: (value * BYTE).round().to(torch.uint8) for key, value in in_bytes.items()}
 
 
@@ -371,9 +373,9 @@ def restore_surfaces(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabul
     """Undo `store_surfaces`; None without any. Raises ValueError, KeyError and TypeError where tensors do not fit."""
     if not tensors:
         return None
-    whole = {name: tensors[name].long() for name in ("surface", "cell")}
+    whole = {name: tensors[name].long() for name in ("surface", "cell", "garment", "printed", "box")}
     flags = {name: tensors[name].bool() for name in ("read", "drawn")}
-    of_voxels = {"share": tensors["share"].float() / BYTE, "tone": tensors["tone"].float() / BYTE * BRIGHTEST}
+    of_voxels = {name: tensors[name].float() / BYTE * most for name, most in _OF_VOXELS.items()}
     surfaces = Surfaces(**{**tensors, **whole, **flags, **of_voxels})
     check_surfaces(surfaces, vocabulary)
     return surfaces

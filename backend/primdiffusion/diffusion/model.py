@@ -280,11 +280,14 @@ def check_surfaces(surfaces: Surfaces, vocabulary: AttributeVocabulary) -> None:
     check_shapes(surfaces)
     if surfaces.condition.shape[1] != vocabulary.width:
         raise ValueError(f"surfaces are described by {surfaces.condition.shape[1]} values, not {vocabulary.width}")
-    limits = (("surface", surfaces.surface, len(surfaces.condition)), ("cell", surfaces.cell, K))
-    for name, numbers, count in limits:
+    kinds, prints, boxes = len(surfaces.condition), len(surfaces.print_condition), len(surfaces.cell)
+    limits = {"surface": kinds, "cell": K, "garment": kinds, "printed": prints, "box": boxes}
+    for name, count in limits.items():
+        numbers = getattr(surfaces, name)
         if bool((numbers < 0).any()) or bool((numbers >= count).any()):
             raise ValueError(f"{name} has numbers that are not from 0 to {count - 1}")
-    for name, values, largest in (("share", surfaces.share, 1.0), ("tone", surfaces.tone, BRIGHTEST)):
+    for name, largest in {"share": 1.0, "tone": BRIGHTEST, "second": 1.0}.items():
+        values = getattr(surfaces, name)
         if bool((values < 0).any()) or bool((values > largest).any()):
             raise ValueError(f"{name} has values that are not from 0 to {largest:g}")
 

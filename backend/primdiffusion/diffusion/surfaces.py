@@ -1,14 +1,18 @@
-"""Surfaces of one colour: hair, hats, plain garments and skin.
+"""Surfaces of one colour: hair, hats, plain garments and skin; and prints in two.
 
 Person components are directions that all people have in common, so colours of one surface come to others: hair on a
 back has the colour of the shirt, plain shirts have a shade of prints, arms are darker than the face. But a style of
 hair, or a garment, is one mesh with one texture: a voxel of it has nearly the same tone of the surface's colour on
 everybody (`training.surfaces`).
+
+Person components also mix prints: a shirt between stripes and checks is neither. But a print is at the same place of a
+garment on everybody who has it, in two colours (`training.prints`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,11 +26,15 @@ SURELY = 0.75
 """Share of a surface above which a voxel counts for the surface's colour."""
 BRIGHTEST = 2.0
 """Largest tone."""
+DIMMEST = 0.3
+"""Darker voxels say little of a garment's colours."""
+EXPLAINED = 0.5
+"""Share of the variance of a garment's colours that its prints explain together, or it has another one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Surfaces(TensorRecord):
-    """L surfaces in N boxes. Later ones cover earlier ones."""
+    """L surfaces in N boxes, of which later ones cover earlier ones, and Q prints in M of these boxes."""
 
     condition: Float[Tensor, "l x"]
     """What all people who have the surface are like: 1 at their values (`AttributeVocabulary.encode`)."""
@@ -42,12 +50,23 @@ class Surfaces(TensorRecord):
     """Whether the surface's colour is read here."""
     drawn: Bool[Tensor, "n"]
     """Whether it is drawn here; faces keep their own colours."""
+    print_condition: Float[Tensor, "q x"]
+    """What all people who have the print, or another one on the same garment, are like."""
+    garment: Int[Tensor, "q"]
+    """The surface whose boxes and tones the print has; its other boxes have the first colour."""
+    printed: Int[Tensor, "m"]
+    """The print that the box shows."""
+    box: Int[Tensor, "m"]
+    """The box's place among the N."""
+    second: Float[Tensor, "m 512"]
+    """How much of a voxel's colour is the second one, 0 ... 1."""
 
     def recolour(self, cells: Float[Tensor, "b k v"], kind: Float[Tensor, "b x"]) -> Float[Tensor, "b k v"]:
-        """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour."""
+        """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour, and
+        each of their prints in two."""
         recoloured = cells.clone()
-        missing = self.condition.sum(1) - kind @ self.condition.T
-        for person, its in enumerate(missing < 0.5):
+        having, printed = (_fitting(kind, condition) for condition in (self.condition, self.print_condition))
+        for person, its in enumerate(having):
             surfaces = its.nonzero()[:, 0].tolist()
             covered = cells.new_zeros(cells.shape[1], S**3)
             colours = {}
@@ -56,12 +75,48 @@ class Surfaces(TensorRecord):
                 colours[surface] = self._colour(cells[person], own & self.read, 1 - covered)
                 own &= self.drawn
                 covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
+            for garment in self.garment[printed[person]].unique().tolist():
+                boxes = ((self.surface == garment) & self.read & self.drawn).nonzero()[:, 0]
+                prints = (printed[person] & (self.garment == garment)).nonzero()[:, 0].tolist()
+                rgb = self._printed(cells[person], boxes, prints, 1 - covered)
+                recoloured[person, self.cell[boxes], : 3 * S**3] = rgb.mT.flatten(1)
             for surface in surfaces:
                 own = (self.surface == surface) & self.drawn
                 rgb = voxels_of(recoloured[person, self.cell[own]])[..., :3]
                 rgb = torch.lerp(rgb, self.tone[own][..., None] * colours[surface], self.share[own][..., None])
                 recoloured[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
         return recoloured
+
+    def _printed(
+        self, cells: Float[Tensor, "k v"], boxes: Int[Tensor, "r"], prints: Sequence[int], bare: Float[Tensor, "k 512"]
+    ) -> Float[Tensor, "r 512 3"]:
+        """A garment's colours in one of these prints, as strong as they are; unchanged if prints do not explain them.
+
+        A sample is a mixture of prints: it gets the one whose two colours differ most.
+        """
+        voxels, tone = voxels_of(cells[self.cell[boxes]]), self.tone[boxes]
+        weight = (seen(voxels) * bare[self.cell[boxes]] * (tone > DIMMEST)).flatten()
+        weight = weight / weight.sum().clamp_min(1e-6)
+        untoned = (voxels[..., :3] / tone.clamp_min(DIMMEST)[..., None]).flatten(0, 1)
+        mean = weight @ untoned
+        variance = weight @ (untoned - mean).square().sum(1)
+        second = torch.stack([self._second(number)[boxes].flatten() for number in prints])
+        centred = second - (second @ weight)[:, None]
+        gram, by_colour = (centred * weight) @ centred.T, (centred * weight) @ untoned
+        together = torch.linalg.solve(gram + 1e-4 * torch.eye(len(gram)).to(gram), by_colour)
+        if (together * by_colour).sum() < EXPLAINED * variance:
+            return voxels[..., :3]
+        best = together.square().sum(1).argmax()
+        slope = by_colour[best] / gram[best, best].clamp_min(1e-6)
+        strength = (variance / (gram[best, best] * slope.square().sum()).clamp_min(1e-6)).sqrt()
+        colours = mean + strength * centred[best][:, None] * slope
+        return (tone[..., None] * colours.view_as(voxels[..., :3])).clamp(0, 1)
+
+    def _second(self, number: int) -> Float[Tensor, "n 512"]:
+        """How much of all voxels is a print's second colour."""
+        own, second = self.printed == number, torch.zeros_like(self.tone)
+        second[self.box[own]] = self.second[own]
+        return second
 
     def _colour(
         self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"], bare: Float[Tensor, "k 512"]
@@ -74,6 +129,11 @@ class Surfaces(TensorRecord):
         of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / tone.clamp_min(1e-6)
         sure = weight.sum(1) > whole.sum(1) / 2
         return of_boxes[sure].median(0).values if sure.any() else of_boxes.mean(0)
+
+
+def _fitting(kind: Float[Tensor, "b x"], condition: Float[Tensor, "n x"]) -> Bool[Tensor, "b n"]:
+    """Which conditions are true of people of these kinds."""
+    return condition.sum(1) - kind @ condition.T < 0.5
 
 
 def voxels_of(cells: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 512 4"]:

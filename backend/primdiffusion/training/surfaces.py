@@ -18,14 +18,13 @@ from torch.nn import functional
 
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.surfaces import BRIGHTEST, SURELY, Surfaces, seen, voxels_of
+from primdiffusion.diffusion.surfaces import BRIGHTEST, DIMMEST, SURELY, Surfaces, seen, voxels_of
 from primdiffusion.editing.regions import region_of
 from primdiffusion.primitives.primitives import S
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
+from primdiffusion.training.prints import FEWEST_GEOMETRIES, Print, find_prints
 
-FEWEST_GEOMETRIES = 4
-"""With fewer people chance looks like a surface."""
 PASSES = 3
 """Regressions, each on the colour of what the former found."""
 CHUNK = 16
@@ -42,7 +41,7 @@ COVERED, OTHERS = 0.85, 0.3
 """Least slope of a box's colour on the surface's, as a share of its tone, and largest slopes on other colours."""
 UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
-UNEVEN_GARMENT = 0.0125
+UNEVEN_GARMENT = 0.0136
 """The same in the median over a garment's boxes: more are prints and fades, which plain garments may have too."""
 UNEVEN_BORDER = 0.09
 """The same of voxels where surfaces meet, in boxes that are wholly explained by them."""
@@ -84,7 +83,16 @@ def fit_surfaces(
         return None
     conditions, rows = zip(*found, strict=True)
     surface = torch.cat([torch.full((len(each.cell),), number) for number, each in enumerate(rows)])
-    return Surfaces(torch.stack(conditions), surface, *(torch.cat(each) for each in zip(*rows, strict=True)))
+    cell, share, tone, read, drawn = (torch.cat(each) for each in zip(*rows, strict=True))
+    of_prints = [(torch.zeros(0, vocabulary.width), *(surface[:0],) * 3, share[:0])]
+    for garment, condition in enumerate(conditions):
+        boxes = ((surface == garment) & read & drawn).nonzero()[:, 0]
+        for values, found_print in known.prints(condition, cell[boxes], tone[boxes]):
+            number = torch.tensor([len(of_prints) - 1])
+            box = boxes[found_print.box]
+            of_prints.append((values[None], torch.tensor([garment]), number.expand(len(box)), box, found_print.second))
+    print_fields = (torch.cat(each) for each in zip(*of_prints, strict=True))
+    return Surfaces(torch.stack(conditions), surface, cell, share, tone, read, drawn, *print_fields)
 
 
 class _People:
@@ -119,9 +127,13 @@ class _People:
         Hanging hair covers clothes: without, people who have it are left out.
         """
         row = self.vocabulary.encode(attributes)
+        return row, self.of(row, hanging)
+
+    def of(self, row: Float[Tensor, "a"], hanging: bool) -> Int[Tensor, "n"]:
+        """The people of a condition, as `with_all`."""
         own = (self.condition @ row >= row.sum()) & (hanging | ~self.hanging)
         few = len(self.geometry[own].unique()) < FEWEST_GEOMETRIES
-        return row, (own & (not few)).nonzero()[:, 0]
+        return (own & (not few)).nonzero()[:, 0]
 
     def worn(self, attributes: Mapping[str, str], plain: Mapping[str, str]) -> list[tuple[Tensor, _Rows]]:
         """Skin and plain garments of an outfit, in the boxes that they cover and in the voxels where they meet."""
@@ -134,16 +146,16 @@ class _People:
         if skin is None or not (skin & face).any():
             return []
         found = [(row, self.rows(own, skin, read=face, drawn=~face))]
+        whoever, everyone = row, own
         row, own = self.with_all({**attributes, **plain}, hanging=False)
+        patterned = everyone[~torch.isin(everyone, own)]
         boxes, parts, left = self.boxes[own], [skin & face], ~skin & ~region_of(("face", "hair", "hands"))
         while len(own) and (start := _largest(boxes, left)) is not None:
             garment = _covered(boxes, start, [boxes[:, part].mean(1) for part in parts], left)
-            if garment is None:
-                left &= ~start
-                continue
-            left &= ~(start | garment)
-            if _tones(boxes, garment)[1][garment].median() < UNEVEN_GARMENT:
+            left &= ~(start if garment is None else start | garment)
+            if garment is not None:
                 parts.append(garment)
+        parts = [parts[0], *(part for part in parts[1:] if self.even(own, part))]
         if len(parts) == 1:
             return found
         meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
@@ -151,8 +163,30 @@ class _People:
         for part, border in zip(parts, self.borders(own, parts, meet), strict=True):
             drawn = torch.full_like(skin, part is not parts[0])  # the face, where skin is read, keeps its colours
             whole = self.rows(own, part, read=everywhere, drawn=drawn)
+            if part is not parts[0] and len(patterned) and self.even(patterned, part):
+                found.append((whoever, whole))  # the pattern is another garment's
             found.append((row, _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))))
         return found
+
+    def even(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> bool:
+        """Whether it has one colour on these people."""
+        return bool(_tones(self.boxes[people], garment)[1][garment].median() < UNEVEN_GARMENT)
+
+    def prints(
+        self, condition: Float[Tensor, "a"], cells: Int[Tensor, "r"], tone: Float[Tensor, "r 512"]
+    ) -> Iterator[tuple[Float[Tensor, "a"], Print]]:
+        """Prints on a garment whose plain form is worn by people of this condition, and the condition of each."""
+        plain = self.vocabulary.encode(self.only("pattern", "plain"))
+        if not len(cells) or not plain.any() or condition @ plain == 0:
+            return
+        for pattern in self.vocabulary.categories["pattern"]:
+            row = condition - plain + self.vocabulary.encode({"pattern": pattern})
+            own = self.of(row, hanging=False) if pattern != "plain" else []
+            if len(own):
+                voxels = torch.cat([voxels[:, cells] for voxels in self.voxels(own)])
+                weight = seen(voxels).mean(0) * (tone > DIMMEST)
+                untoned = voxels[..., :3] / tone.clamp_min(DIMMEST)[..., None]
+                yield from ((row, one) for one in find_prints(untoned, weight, self.geometry[own]))
 
     def rows(
         self, own: Int[Tensor, "n"], part: Bool[Tensor, "k"], read: Bool[Tensor, "k"], drawn: Bool[Tensor, "k"]

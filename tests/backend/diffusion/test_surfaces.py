@@ -1,4 +1,4 @@
-"""Surfaces of one colour: found in people whose colours are known, drawn in one colour, stored in bytes."""
+"""Surfaces of one colour and prints in two: found in people whose colours are known, drawn, stored in bytes."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ from support.tiny import model_of_two_kinds
 
 WORDS = AttributeVocabulary(
     {
-        "outfit": ("jumper", "suit", "tee"),
+        "outfit": ("jumper", "leggings", "suit", "tee"),
         "pattern": ("patterned", "plain"),
         "hair": ("bald", "long", "short"),
         "hat": ("cap", "none"),
@@ -28,7 +28,7 @@ WORDS = AttributeVocabulary(
     {},
 )
 GEOMETRIES, COLOURINGS = 6, 6
-WORN = ("hair", "tee", "trousers", "skin", "cap")
+WORN = ("hair", "tee", "trousers", "skin", "cap", "print")
 INNER, OUTER = slice(0, S**3 // 2), slice(S**3 // 2, S**3)
 """Halves of a box, near the body and away from it."""
 FAR_IN, FAR_OUT = slice(0, S**3 // 2 - S**2), slice(S**3 // 2 + S**2, S**3)
@@ -36,8 +36,10 @@ FAR_IN, FAR_OUT = slice(0, S**3 // 2 - S**2), slice(S**3 // 2 + S**2, S**3)
 HANGING, CUFF = 0.6, 0.8
 """Tones of hair that hangs, and of a tee's lower part."""
 TOP, CUFFS, BARE = ("torso", "upper_arms"), ("upper_arms",), ("forearms", "hands", "shins", "face")
+LEGGINGS = ("hips", "thighs", "shins")
 COLLAR = ("neck",)
 """The outer half is the tee's; the inner one is skin."""
+PRINTS = ("stripes", "block")
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +63,21 @@ def below_cap():
     return region_of(("hair",)).nonzero()[::2, 0]
 
 
-def dressed(hair, colours, generator, patterned=False, cap=False, suit=False):
-    """Cells of a person in a tee and faded trousers, or a suit; boxes of a patterned tee have colours of their own."""
+def second_of(pattern):
+    """Boxes of a tee in its second colour."""
+    tee = region_of(TOP)
+    every_third = torch.zeros(K, dtype=torch.bool).index_fill(0, tee.nonzero()[::3, 0], True)
+    return {"stripes": every_third, "block": region_of(CUFFS)}[pattern]
+
+
+def printed(colours, pattern, strength=1.0):
+    """Colours of the boxes [K, 3] of a printed tee, of which the cuffs are darker."""
+    boxes = torch.lerp(colours["tee"], colours["print"], strength * second_of(pattern).float()[:, None])
+    return torch.where(region_of(CUFFS)[:, None], CUFF * boxes, boxes)
+
+
+def dressed(hair, colours, generator, pattern="", cap=False, outfit="tee"):
+    """Cells of a person in a tee with faded trousers or leggings, or in a suit."""
     voxels = torch.zeros(K, S**3, 4)
     voxels[..., 3] = 1.0
     voxels[..., :3] = colours["skin"]
@@ -74,10 +89,12 @@ def dressed(hair, colours, generator, patterned=False, cap=False, suit=False):
     voxels[region_of(COLLAR), OUTER, :3] = colours["tee"]
     feet = region_of(("feet",))  # socks of the tee's colour, darker or brighter on everybody: no border of surfaces
     voxels[feet, :, :3] = (0.8 + 0.4 * torch.rand(int(feet.sum()), 1, 1, generator=generator)) * colours["tee"]
-    if suit:
+    if outfit == "leggings":
+        voxels[region_of(LEGGINGS), :, :3] = colours["trousers"]
+    if outfit == "suit":
         voxels[region_of((*TOP, "hips", "thighs")), :, :3] = colours["tee"]
-    if patterned:
-        voxels[region_of(TOP), :, :3] = torch.rand(int(region_of(TOP).sum()), 1, 3, generator=generator)
+    if pattern:
+        voxels[region_of(TOP), :, :3] = printed(colours, pattern)[region_of(TOP), None]
     if hair == "bald":
         voxels[region_of(("hair",)), :, :3] *= 0.9 + 0.2 * torch.rand(1, generator=generator)
     else:
@@ -99,14 +116,16 @@ def some_colours(generator):
 def people(codec):
     generator = torch.Generator().manual_seed(1)
     cells, conditions = [], []
-    names = [hair for hair in ("long", "short", "bald", "cap", "suit") for _ in range(GEOMETRIES)]
-    for name in names:
-        cap, suit, hair = name == "cap", name == "suit", name if name in WORDS.categories["hair"] else "short"
+    names = [hair for hair in ("long", "short", "bald", "cap", "suit", "leggings") for _ in range(GEOMETRIES)]
+    for geometry, name in enumerate(names):
+        hair, outfit = (
+            name if name in WORDS.categories[kind] else other for kind, other in (("hair", "short"), ("outfit", "tee"))
+        )
         for number in range(COLOURINGS):
-            patterned = number == 0 and not suit
-            cells.append(dressed(hair, some_colours(generator), generator, patterned, cap, suit))
-            known = {"outfit": "suit" if suit else "tee", "pattern": "patterned" if patterned else "plain"}
-            conditions.append(WORDS.encode({**known, "hair": hair, "hat": "cap" if cap else "none"}))
+            pattern = PRINTS[geometry % 2] if number == 0 and outfit != "suit" else ""
+            cells.append(dressed(hair, some_colours(generator), generator, pattern, name == "cap", outfit))
+            known = {"outfit": outfit, "pattern": "patterned" if pattern else "plain"}
+            conditions.append(WORDS.encode({**known, "hair": hair, "hat": "cap" if name == "cap" else "none"}))
     geometry = torch.arange(len(names)).repeat_interleave(COLOURINGS)
     latents = codec.encode(torch.stack(cells)).half()
     return LatentSet(
@@ -170,6 +189,11 @@ def test_a_suit_of_one_cloth_is_one_surface(surfaces):
     assert torch.equal(over(suit.read, suit.cell), region_of((*TOP, "hips", "thighs")))
 
 
+def test_a_pattern_on_the_tee_leaves_the_leggings_in_one_colour(surfaces):
+    _, leggings = rows_of(surfaces, outfit="leggings")
+    assert torch.equal(over(leggings.drawn, leggings.cell), region_of(LEGGINGS))
+
+
 def test_voxels_where_surfaces_meet_belong_to_each(surfaces):
     bare, tee = (each for each in rows_of(surfaces, outfit="tee", pattern="plain"))
     collar = region_of(COLLAR)
@@ -222,6 +246,43 @@ def test_patterned_garments_keep_their_pattern(surfaces):
     assert torch.equal(surfaces.recolour(cells, kind[None])[:, top], cells[:, top])
 
 
+def test_prints_that_people_share_are_found(surfaces):
+    assert len(surfaces.print_condition) == len(PRINTS)
+    for condition in surfaces.print_condition:
+        assert torch.equal(condition, WORDS.encode({"outfit": "tee", "pattern": "patterned"}))
+    found = [
+        over(surfaces.second[own], surfaces.cell[surfaces.box[own]])
+        for own in (surfaces.printed == number for number in range(len(PRINTS)))
+    ]
+    for pattern in PRINTS:
+        second = second_of(pattern)
+        errors = [float((one[region_of(TOP)] - second[region_of(TOP)].float()[:, None]).abs().max()) for one in found]
+        assert min(errors) < 0.1
+
+
+@pytest.mark.parametrize(("pattern", "hair"), [("stripes", "bald"), ("block", "bald"), ("stripes", "long")])
+def test_a_mixture_of_prints_becomes_the_nearest_one(surfaces, pattern, hair):
+    generator = torch.Generator().manual_seed(3)
+    colours = some_colours(generator)
+    mixed = voxels_of(dressed(hair, colours, generator, pattern)).clone()
+    other = PRINTS[1 - PRINTS.index(pattern)]
+    tee = region_of(TOP)
+    if hair == "long":
+        tee[below_hair()] = False
+    mixed[tee, :, :3] = ((printed(colours, pattern, 0.7) + printed(colours, other, 0.4)) / 2)[tee, None]
+    cells = torch.nn.functional.pad(mixed.mT.flatten(1), (0, 3), value=SCALE_VALUE)
+    kind = WORDS.encode({"outfit": "tee", "pattern": "patterned", "hair": hair, "hat": "none"})
+    drawn = voxels_of(surfaces.recolour(cells[None], kind[None])[0])
+    tone = torch.where(region_of(CUFFS)[tee], CUFF, 1.0)[:, None]
+    second = second_of(pattern)[tee]
+    before, after = (voxels[tee, :, :3].mean(1) / tone for voxels in (mixed, drawn))
+    for part in (second, ~second):
+        assert float(after[part].std(0).max()) < 0.02 < float(before[part].std(0).max())
+    weaker, stronger = ((boxes[second].mean(0) - boxes[~second].mean(0)).norm() for boxes in (before, after))
+    assert float(stronger) > float(weaker)
+    torch.testing.assert_close(after.mean(0), before.mean(0), atol=0.02, rtol=0)
+
+
 def test_few_people_or_unknown_ones_have_no_surfaces(people, codec):
     few = people.geometry % GEOMETRIES == 1  # three geometries
     some = dataclasses.replace(
@@ -242,6 +303,8 @@ def model_with_surfaces():
     surfaces = Surfaces(
         torch.tensor([[1.0, 0, 1, 0]]), torch.zeros(5, dtype=torch.int64), torch.arange(40, 45), share,
         BRIGHTEST * tone, read, torch.ones_like(read),
+        torch.tensor([[0.0, 1, 0, 1]]), torch.zeros(1, dtype=torch.int64), torch.zeros(2, dtype=torch.int64),
+        torch.arange(2), torch.rand(2, S**3, generator=generator),
     )  # fmt: skip
     return dataclasses.replace(model, surfaces=surfaces), surfaces
 
@@ -270,7 +333,8 @@ def test_surfaces_are_stored_in_bytes(tmp_path):
     assert loaded is not None
     torch.testing.assert_close(loaded.share, surfaces.share, atol=0.5 / 255 + 1e-6, rtol=0)
     torch.testing.assert_close(loaded.tone, surfaces.tone, atol=0.5 * BRIGHTEST / 255 + 1e-6, rtol=0)
-    for name in ("condition", "surface", "cell", "read", "drawn"):
+    torch.testing.assert_close(loaded.second, surfaces.second, atol=0.5 / 255 + 1e-6, rtol=0)
+    for name in ("condition", "surface", "cell", "read", "drawn", "print_condition", "garment", "printed", "box"):
         assert torch.equal(getattr(loaded, name), getattr(surfaces, name))
 
 
@@ -280,9 +344,13 @@ def test_surfaces_are_stored_in_bytes(tmp_path):
         ({"cell": torch.arange(K, K + 5)}, "cell"),
         ({"cell": torch.arange(4)}, ""),
         ({"surface": torch.ones(5, dtype=torch.int64)}, "surface"),
-        ({"condition": torch.ones(1, 3)}, "3 values"),
+        ({"condition": torch.ones(1, 3)}, "condition"),
         ({"share": torch.full((5, S**3), 1.5)}, "share"),
         ({"tone": torch.full((5, S**3), -0.5)}, "tone"),
+        ({"garment": torch.ones(1, dtype=torch.int64)}, "garment"),
+        ({"printed": torch.tensor([0, -1])}, "printed"),
+        ({"box": torch.tensor([0, 5])}, "box"),
+        ({"second": torch.full((2, S**3), 1.5)}, "second"),
     ],
 )
 def test_surfaces_that_do_not_fit_are_refused(damage, named):

@@ -77,6 +77,7 @@ def test_unseen_sides_have_surfaces_of_one_colour():
     surfaces = Surfaces(
         torch.zeros(1, MODEL.vocabulary.width), torch.zeros(2, dtype=torch.int64), torch.cat([front, back]), ones,
         torch.stack([ones[0], 0.5 * ones[0]]), torch.tensor([True, False]), torch.tensor([False, True]),
+        torch.zeros(0, MODEL.vocabulary.width), *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0],
     )  # fmt: skip
     person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
     plain, found = (

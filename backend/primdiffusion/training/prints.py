@@ -1,0 +1,85 @@
+"""Find prints: patterns in two colours that several people have at the same place of a garment.
+
+What a printed garment differs by from its mean colour is one pattern times one difference of colours, so it is the
+leading direction of its voxels' colours. People whose patterns are alike have the same print.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from primdiffusion.primitives.primitives import S
+
+ALIKE = 0.55
+"""Least cosine of the patterns of two people who have the same print."""
+STRONG = 0.04
+"""Least rms difference from a garment's mean colour: less is light and folds."""
+FEWEST_GEOMETRIES = 4
+"""With fewer people chance looks like a surface, or a print."""
+CLEAR = 0.02
+"""Share of voxels that are wholly in the first colour, and in the second."""
+FAINT = 0.03
+"""Boxes with less of the second colour are left out."""
+
+
+class Print(NamedTuple):
+    """A print on m of a garment's boxes."""
+
+    box: Int[Tensor, "m"]
+    """Places among the garment's boxes."""
+    second: Float[Tensor, "m 512"]
+    """How much of a voxel's colour is the second one."""
+
+
+def find_prints(
+    colours: Float[Tensor, "n r 512 3"], weight: Float[Tensor, "r 512"], geometry: Int[Tensor, "n"]
+) -> list[Print]:
+    """Prints of a garment with r boxes that enough people have; the most common one first.
+
+    `colours` are those of its voxels on each of n people, over the garment's tones, and `weight` how much a voxel
+    counts. `geometry` tells people from further colourings of them.
+    """
+    share = (weight / weight.sum().clamp_min(1e-6)).flatten()
+    flat = colours.flatten(1, 2)
+    centred = (flat - torch.einsum("v,nvc->nc", share, flat)[:, None]) * share.sqrt()[:, None]
+    strong = (centred.square().sum((1, 2)) / 3).sqrt() > STRONG
+    centred, geometry = centred[strong], geometry[strong]
+    if not len(centred):
+        return []
+    patterns = torch.stack([_leading(one.T) for one in centred])
+    alike = (patterns @ patterns.T).abs() > ALIKE
+    left, prints = torch.ones(len(alike), dtype=torch.bool), []
+    while (counts := (alike & left).sum(1) * left).any():
+        same = alike[counts.argmax()] & left
+        left &= ~same
+        left[counts.argmax()] = False
+        if len(geometry[same].unique()) >= FEWEST_GEOMETRIES:
+            prints.append(_print(_leading(centred[same].mT.flatten(0, 1)), share, weight.shape[0]))
+    return prints
+
+
+def _leading(rows: Float[Tensor, "m v"]) -> Float[Tensor, "v"]:
+    """The leading direction of rows, of length 1."""
+    vector = torch.linalg.eigh(rows @ rows.T)[1][:, -1] @ rows
+    return vector / vector.norm().clamp_min(1e-12)
+
+
+def _print(pattern: Float[Tensor, "v"], share: Float[Tensor, "v"], boxes: int) -> Print:
+    """Shares of the second colour, which is that of fewer voxels."""
+    value = pattern / share.sqrt().clamp_min(1e-6)
+    order = value.argsort()
+    before = share[order].cumsum(0)
+    first, second = (
+        value[order[torch.searchsorted(before, at).clamp_max(len(order) - 1)]] for at in (CLEAR, 1 - CLEAR)
+    )
+    mixed = ((value - first) / (second - first).clamp_min(1e-6)).clamp(0, 1)
+    if (mixed * share).sum() > 0.5:
+        mixed = 1 - mixed
+    mixed = mixed.view(boxes, S**3)
+    of_boxes = share.view_as(mixed)
+    shown = (mixed * of_boxes).sum(1) > FAINT * of_boxes.sum(1)
+    return Print(shown.nonzero()[:, 0], mixed[shown])
