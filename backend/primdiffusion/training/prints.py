@@ -56,7 +56,6 @@ def find_prints(
     while (counts := (alike & left).sum(1) * left).any():
         same = alike[counts.argmax()] & left
         left &= ~same
-        left[counts.argmax()] = False
         if len(geometry[same].unique()) >= FEWEST_GEOMETRIES:
             prints.append(_print(_leading(centred[same].mT.flatten(0, 1)), share, weight.shape[0]))
     return prints
