@@ -179,9 +179,9 @@ class _People:
         plain = self.vocabulary.encode(self.only("pattern", "plain"))
         if not len(cells) or not plain.any() or condition @ plain == 0:
             return
-        for pattern in self.vocabulary.categories["pattern"]:
+        for pattern in sorted({*self.vocabulary.categories["pattern"]} - {"plain"}):
             row = condition - plain + self.vocabulary.encode({"pattern": pattern})
-            own = self.of(row, hanging=False) if pattern != "plain" else []
+            own = self.of(row, hanging=False)
             if len(own):
                 voxels = torch.cat([voxels[:, cells] for voxels in self.voxels(own)])
                 weight = seen(voxels).mean(0) * (tone > DIMMEST)
