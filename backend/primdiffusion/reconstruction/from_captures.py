@@ -236,15 +236,20 @@ class PriorFit:
 
     def _kinds(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
         """People of an outfit and head, and channels of each box by their weights; those asked for last are kept."""
-        if group is None:
-            return self._everyone
         if (group, head) != self._latest[0]:
-            self._latest[:] = [(group, head), self._codes_of(self.prior.gaussian_of(group, head).leading(DIRECTIONS))]
+            self._forget()
+            everyone = group is None
+            kinds = self._everyone if everyone else self.prior.gaussian_of(group, head).leading(DIRECTIONS)
+            self._latest[:] = [(group, head), self._codes_of(kinds)]
         return self._latest[1]
 
+    def _forget(self) -> None:
+        """Let go of the latest kinds, whose channels are 50 MB."""
+        self._latest[:] = [None, None]
+
     @functools.cached_property
-    def _everyone(self) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
-        return self._codes_of(self.prior.gaussian_of_all(DIRECTIONS))
+    def _everyone(self) -> GaussianOfKinds:
+        return self.prior.gaussian_of_all(DIRECTIONS)
 
     def _codes_of(self, kinds: GaussianOfKinds) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
         codes = torch.empty(*self.prior.basis.shape[1:], len(kinds.factor))
@@ -339,6 +344,7 @@ class PriorFit:
         targets = targets_of(views, frames, FINE_SIDE)
         settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
         coefficients = self.coefficients(explanation)
+        self._forget()
         rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
         start = self.decode(self.prior.join(coefficients[None], rest[None])[0])
         payload = fit_payload(start, targets, self.full_density, settings)
