@@ -7,13 +7,14 @@ that then explain the pictures (`reconstruction`) give it the colours by which l
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
@@ -23,7 +24,7 @@ from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.reconstruction.from_captures import PriorFit, targets_of
+from primdiffusion.reconstruction.from_captures import Explanation, PriorFit, targets_of
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
@@ -62,6 +63,8 @@ LIKELY_START, LIKELY = 1.8, 1.5
 FRONT = 30.0
 """Logarithm of how much more probable a picture from the front is than one from behind: most people show their face,
 and colours tell less before the pose is found exactly."""
+OWN_COLOURS = Stage(20, 0.03, upright=False)
+"""Before turns are told by colours, with those of each: limbs that are elsewhere would count more than a face."""
 TURN_STEPS = 3
 """Gauss-Newton steps on coefficients whose evidence tells the turns that are left: a face from hair."""
 OUTLINE_IN_PICTURE = 256
@@ -130,8 +133,7 @@ def person_in_pictures(
     elif not start.complete:
         raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
     else:
-        targets = _targets(photographs, start.posture, ROUNDS[-1].side)
-        found = Found(start.posture, _cut_out(_mean_human(model), photographs, targets))
+        found = Found(start.posture, _cut_out_twice(model, photographs, start.posture))
     if pose is None:
         facing = ", facing the camera" if len(photographs) == 1 else ""
         warnings.append(f"no pose was given: the person is taken to stand upright{facing}")
@@ -189,10 +191,10 @@ def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, 
     Not `turned`: a single picture shows a person from the front; outlines tell front from back too seldom.
     """
     payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
-    for degrees, stances in STANCES.items() if turned else [(0, STANCES[0])]:
+    for degrees, stances in STANCES if turned else STANCES[:1]:
         tried = []
         for stance in stances:
-            pose = standing(*stance, degrees)
+            pose = standing(*stance, turned=degrees)
             lens = photograph.lens() if view is None else view
             posture = Posture(pose, betas, framed([photograph], pose, betas, [lens]))
             tried.append((outline_error(payload, *_targets([photograph], posture, OUTLINE_SIDE)), posture))
@@ -233,8 +235,14 @@ def fit_posture_in(
         fit.refine(payload, targets(side), stage, on_step, shaped=not several)  # a wrong turn would bend the shape
         if several:
             if coefficient_steps:
-                away = FRONT * (1 - fit.posture().facing) / 2
-                kept = _likely([_misfit(components, one) for one in targets(side)] + away.numpy(), pictures)
+                own = [_person_in(components, [one]) for one in targets(side)]
+                fit.refine(
+                    [components.payload(components.coefficients(one)) for one in own],
+                    targets(side),
+                    OWN_COLOURS,
+                    shaped=False,
+                )
+                kept = _explained(components, targets(side), pictures, fit.posture().facing.numpy())
             else:
                 kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, LIKELY)
             fit.keep(kept)
@@ -254,12 +262,39 @@ def _likely(errors: Sequence[float] | np.ndarray, pictures: Sequence[int], share
     return [one for one, own in pairs if one == least[own] or errors[one] < share * errors[least[own]]]
 
 
-def _misfit(components: PriorFit, target: PosedView) -> float:
-    """How badly people of any colours explain a picture: a face tells front from back."""
+def _explained(
+    components: PriorFit, targets: Sequence[PosedView], pictures: Sequence[int], facing: Float[np.ndarray, "n"]
+) -> list[int]:
+    """Numbers of the turns that explain the pictures best, one for each.
+
+    Pictures are decided one after the other, the clearest first; each has to show the same person as those before.
+    """
+    alone = [
+        FRONT * (1 - away) / 2 - _person_in(components, [one]).evidence
+        for one, away in zip(targets, facing, strict=True)
+    ]
+    turns = [[one for one, own in enumerate(pictures) if own == picture] for picture in sorted(set(pictures))]
+
+    def doubt(numbers: list[int]) -> float:
+        best, *others = sorted(alone[one] for one in numbers)
+        return best - others[0] if others else -math.inf
+
+    kept: list[int] = []
+    for numbers in sorted(turns, key=doubt):
+        errors = dict(enumerate(alone))
+        if kept and len(numbers) > 1:
+            before = [targets[one] for one in kept]
+            errors = {one: -_person_in(components, [*before, targets[one]]).evidence for one in numbers}
+        kept.append(min(numbers, key=errors.__getitem__))
+    return sorted(kept)
+
+
+def _person_in(components: PriorFit, targets: Sequence[PosedView]) -> Explanation:
+    """The person of any colours that explains pictures best: a face tells front from back."""
     people = components.everyone()
     for _ in range(TURN_STEPS):
-        people = components.closer(people, [target])
-    return -people.evidence
+        people = components.closer(people, targets)
+    return people
 
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
@@ -274,6 +309,20 @@ def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Seque
     """The photographs; the persons of those without a mask are cut out again, by the human's outline."""
     pairs = zip(photographs, targets, strict=True)
     return [one if one.uncut is None else cut_by_outline(payload, one, target) for one, target in pairs]
+
+
+def _cut_out_twice(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> Sequence[Photograph]:
+    """As `_cut_out`, by the mean human and then by one with the colours and clothes of the first cut."""
+    if all(one.uncut is None for one in photographs):
+        return photographs
+    components = PriorFit.of(model)
+    people = components.everyone()
+    for round_ in ROUNDS[:2]:
+        for _ in range(round_.coefficient_steps):
+            people = components.closer(people, _targets(photographs, posture, round_.side))
+        payload = components.payload(components.coefficients(people))
+        photographs = _cut_out(payload, photographs, _targets(photographs, posture, ROUNDS[-1].side))
+    return photographs
 
 
 def _mean_human(model: DiffusionModel) -> Payload:
