@@ -21,7 +21,7 @@ And of the first --robust humans, camera error (camera_error_px_...) and PSNR (p
     pose_10, pose_20 joints turned by 10 and 20 degrees
     turned_10       the whole body turned by 10 degrees about the vertical besides
 
-`python benchmarks/plain_pictures.py spoiled --assets DIR --json F` adds figures of 40 spoiled pictures (--pictures) and
+`python benchmarks/plain_pictures.py spoiled --assets DIR --json F` measures 40 spoiled pictures (--pictures) and
 six good ones of humans as in `upright.py`, by tilted cameras, from a standing start. They are not those by which limits
 were set. A fit is reported if it is below 85 % or left a part of the mask out:
 
@@ -46,7 +46,7 @@ import numpy as np
 import torch
 import upright
 from figure_metrics import figure_psnr
-from from_pictures import GREY, POSES, VIEW, Case, add, captured, case_of, over_grey
+from from_pictures import GREY, POSES, VIEW, Case, captured, case_of, over_grey
 from jaxtyping import Float
 from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
@@ -170,7 +170,7 @@ def spoiled() -> None:
     parser.add_argument("--pictures", type=int, default=40)
     arguments = parser.parse_args()
     assets = open_assets(arguments.assets, required_meshes())
-    add(reported(load_checkpoint(arguments.checkpoint), assets, arguments.pictures), arguments.json)
+    report(reported(load_checkpoint(arguments.checkpoint), assets, arguments.pictures), arguments.json)
 
 
 def reported(model: DiffusionModel, assets: Assets, count: int) -> dict[str, float | int]:

@@ -203,7 +203,7 @@ class PriorFit:
     full_density: float
     decode: Callable[[Tensor], Payload]
     """That of the model, whose surfaces have one colour each, on the CPU."""
-    _latest: list = dataclasses.field(default_factory=lambda: [None, None], repr=False)
+    _latest: list = dataclasses.field(default_factory=lambda: [None, None], init=False, repr=False)
 
     @classmethod
     @functools.lru_cache(maxsize=1)  # the directions of all people take a second

@@ -60,6 +60,8 @@ OUTLINE_SIDE = 64
 """Of the pictures that choose how a standing body stands."""
 LIKELY_START, LIKELY = 1.8, 1.5
 """How much worse than the best an outline may be for a turn of the body to be tried, and after the first round."""
+STANCES_TRIED = 3
+"""In a single picture; the first round leaves one."""
 FRONT = 30.0
 """Logarithm of how much more probable a picture from the front is than one from behind: most people show their face,
 and colours tell less before the pose is found exactly."""
@@ -188,7 +190,8 @@ def start_of(
 def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, turned: bool) -> list[Posture]:
     """Standing bodies of the turns that fit the outline nearly as well as the best, each in its best stance.
 
-    Not `turned`: a single picture shows a person from the front; outlines tell front from back too seldom.
+    Not `turned`: a single picture shows a person from the front, in one of several stances; outlines tell front from
+    back too seldom.
     """
     payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
     for degrees, stances in STANCES if turned else STANCES[:1]:
@@ -198,7 +201,7 @@ def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, 
             lens = photograph.lens() if view is None else view
             posture = Posture(pose, betas, framed([photograph], pose, betas, [lens]))
             tried.append((outline_error(payload, *_targets([photograph], posture, OUTLINE_SIDE)), posture))
-        found.append(min(tried, key=lambda one: one[0]))
+        found += sorted(tried, key=lambda one: one[0])[: 1 if turned else STANCES_TRIED]
     likely = [found[one][1] for one in _likely([error for error, _ in found], [0] * len(found), LIKELY_START)]
     return likely if view is None else [before_cameras(one, cameras_of([photograph], [view])) for one in likely]
 
@@ -244,7 +247,8 @@ def fit_posture_in(
                 )
                 kept = _explained(components, targets(side), pictures, fit.posture().facing.numpy())
             else:
-                kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, LIKELY)
+                share = LIKELY if len(photographs) > 1 else 1.0
+                kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, share)
             fit.keep(kept)
             pictures = [pictures[one] for one in kept]
         for _ in range(coefficient_steps):

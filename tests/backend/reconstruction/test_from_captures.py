@@ -172,7 +172,7 @@ def test_kinds_within_people_explain_pictures_as_their_gaussian_does():
         **parts, basis=PRIOR.basis.mT.flatten(1), log_weight=torch.full((2, 2), 0.25).log(), centre=group,
         axes=PRIOR.axes.repeat(2, 1, 1), variance=variance, kind=PRIOR.kind.repeat(2, 1, 1),
     )  # fmt: skip
-    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior, _latest=[None, None])
+    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior)
     human = human_of(COLOURS / 10)
     targets = targets_of(captured(human, BodyPose.rest(), [0.0]).views, [frames_of(human)], 64)
     everyone = components.everyone()
