@@ -24,7 +24,6 @@ from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.reconstruction.from_captures import Explanation, PriorFit, targets_of
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
@@ -40,6 +39,7 @@ from primdiffusion.reconstruction.posture_start import (
     turned_to_camera,
     views_of,
 )
+from primdiffusion.reconstruction.prior_fit import Explanation, PriorFit, targets_of
 from primdiffusion.render.image import PosedView
 
 

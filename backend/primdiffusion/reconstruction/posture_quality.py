@@ -23,9 +23,9 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.reconstruction.from_captures import PriorFit
 from primdiffusion.reconstruction.posture_fit import COARSE, Posture, each
 from primdiffusion.reconstruction.posture_masks import grown, unexplained
+from primdiffusion.reconstruction.prior_fit import PriorFit
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 

@@ -17,16 +17,8 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
 from primdiffusion.primitives.primitives import Payload, Primitives, S
 from primdiffusion.reconstruction import from_captures
-from primdiffusion.reconstruction.from_captures import (
-    FIT_STEPS,
-    OBSERVATIONS,
-    PIXEL_STD,
-    PriorFit,
-    encode_and_fit,
-    reconstruct,
-    steps_of,
-    targets_of,
-)
+from primdiffusion.reconstruction.from_captures import HUMAN_STEPS, encode_and_fit, reconstruct, steps_of
+from primdiffusion.reconstruction.prior_fit import OBSERVATIONS, PIXEL_STD, PriorFit, targets_of
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
@@ -115,7 +107,7 @@ def test_smaller_pictures_are_what_their_cameras_see():
 def test_every_step_is_reported_and_an_exception_cancels():
     person, steps = captured(human_of(COLOURS), BodyPose.rest(), [0.0]), []
     reconstruct(MODEL, person, on_step=lambda: steps.append(None))
-    assert len(steps) == steps_of(MODEL) > FIT_STEPS
+    assert len(steps) == steps_of(MODEL) > HUMAN_STEPS
     assert steps_of(tiny_encoder()) == 0
 
     def cancel() -> None:

@@ -21,7 +21,6 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import Human, framing, place, pose_body
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reconstruction import from_pictures
-from primdiffusion.reconstruction.from_captures import Explanation
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, deviations, each, outline_error
 from primdiffusion.reconstruction.posture_start import (
     before_cameras,
@@ -35,6 +34,7 @@ from primdiffusion.reconstruction.posture_start import (
     views_of,
     write_posture,
 )
+from primdiffusion.reconstruction.prior_fit import Explanation
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 from support.errors import refused

@@ -14,12 +14,12 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import framing
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.reconstruction.from_captures import PriorFit
 from primdiffusion.reconstruction.from_pictures import Found, fit_quality
 from primdiffusion.reconstruction.posture_fit import Posture
 from primdiffusion.reconstruction.posture_masks import without_things
 from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, FitQuality
 from primdiffusion.reconstruction.posture_start import standing
+from primdiffusion.reconstruction.prior_fit import PriorFit
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 from support.tiny import tiny_model
