@@ -6,6 +6,7 @@ that then explain the pictures (`reconstruction`) give it the colours by which l
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -14,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
@@ -238,14 +239,10 @@ def fit_posture_in(
         fit.refine(payload, targets(side), stage, on_step, shaped=not several)  # a wrong turn would bend the shape
         if several:
             if coefficient_steps:
-                own = [_person_in(components, [one]) for one in targets(side)]
-                fit.refine(
-                    [components.payload(components.coefficients(one)) for one in own],
-                    targets(side),
-                    OWN_COLOURS,
-                    shaped=False,
-                )
-                kept = _explained(components, targets(side), pictures, fit.posture().facing.numpy())
+                facing = fit.posture().facing.tolist()
+                errors, seen = _seen_closely(components, fit, [photographs[one] for one in pictures], side)
+                alone = [error + FRONT * (1 - away) / 2 for error, away in zip(errors, facing, strict=True)]
+                kept = _explained(components, seen, pictures, alone)
             else:
                 share = LIKELY if len(photographs) > 1 else 1.0
                 kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, share)
@@ -266,17 +263,31 @@ def _likely(errors: Sequence[float] | np.ndarray, pictures: Sequence[int], share
     return [one for one, own in pairs if one == least[own] or errors[one] < share * errors[least[own]]]
 
 
+def _seen_closely(
+    components: PriorFit, fit: PostureFit, photographs: Sequence[Photograph], side: int
+) -> tuple[list[float], list[PosedView]]:
+    """How badly a person explains each picture alone, and the picture with the boxes that explain it better: those of
+    the fit, or after some steps more with the colours of that person.
+    """
+    targets, closer = _targets(photographs, fit.posture(), side), copy.deepcopy(fit)
+    people = [_person_in(components, [one]) for one in targets]
+    own = [components.payload(components.coefficients(one)) for one in people]
+    closer.refine(own, targets, OWN_COLOURS, shaped=False)
+    errors, seen = [], []
+    for before, *pair in zip(people, targets, _targets(photographs, closer.posture(), side), strict=True):
+        both = [-before.evidence, -_person_in(components, pair[1:]).evidence]
+        errors.append(min(both))
+        seen.append(pair[both.index(min(both))])
+    return errors, seen
+
+
 def _explained(
-    components: PriorFit, targets: Sequence[PosedView], pictures: Sequence[int], facing: Float[np.ndarray, "n"]
+    components: PriorFit, targets: Sequence[PosedView], pictures: Sequence[int], alone: Sequence[float]
 ) -> list[int]:
-    """Numbers of the turns that explain the pictures best, one for each.
+    """Numbers of the turns that explain the pictures best, one for each; `alone`: how badly each does for itself.
 
     Pictures are decided one after the other, the clearest first; each has to show the same person as those before.
     """
-    alone = [
-        FRONT * (1 - away) / 2 - _person_in(components, [one]).evidence
-        for one, away in zip(targets, facing, strict=True)
-    ]
     turns = [[one for one, own in enumerate(pictures) if own == picture] for picture in sorted(set(pictures))]
 
     def doubt(numbers: list[int]) -> float:

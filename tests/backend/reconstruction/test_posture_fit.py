@@ -290,16 +290,14 @@ def test_a_person_is_found_from_any_side_in_each_picture(monkeypatch):
 
 def test_turns_are_those_of_one_person_in_all_pictures(monkeypatch):
     """The first picture is a clear front; the second alone looks like one too, but not of the same person."""
-    of_one, together = [0.0, 90.0, 50.0, 60.0], {(0, 2): 300.0, (0, 3): 200.0}
+    alone, together = [0.0, 120.0, 50.0, 90.0], {(0, 2): 300.0, (0, 3): 200.0}
 
     def person_in(_, targets):
-        numbers = tuple(targets)
-        return Explanation(None, None, torch.zeros(0), -(together[numbers] if numbers[1:] else of_one[numbers[0]]))
+        return Explanation(None, None, torch.zeros(0), -together[tuple(targets)])
 
     monkeypatch.setattr(from_pictures, "_person_in", person_in)
-    facing = np.array([1.0, -1.0, 1.0, -1.0])
-    assert from_pictures._explained(None, range(4), [0, 0, 1, 1], facing) == [0, 3]
-    assert from_pictures._explained(None, range(2, 4), [0, 0], facing[2:]) == [0]  # only a face tells
+    assert from_pictures._explained(None, range(4), [0, 0, 1, 1], alone) == [0, 3]
+    assert from_pictures._explained(None, range(2), [0, 0], alone[2:]) == [0]
 
 
 def test_each_arm_may_be_raised_in_a_picture_from_the_side():
