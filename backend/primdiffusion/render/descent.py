@@ -131,8 +131,8 @@ class Adam(NamedTuple):
     @classmethod
     def of(cls, values: Sequence[Tensor], betas: tuple[float, float]) -> Adam:
         """At its start."""
-        zeros = [[torch.zeros_like(value, requires_grad=False) for value in values] for _ in range(2)]
-        return cls(list(values), betas, *zeros, [value.new_zeros((), requires_grad=False) for value in values])
+        means, squares = ([torch.zeros_like(value, requires_grad=False) for value in values] for _ in range(2))
+        return cls(list(values), betas, means, squares, [value.new_zeros(()) for value in values])
 
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor], rate: float) -> None:

@@ -1,7 +1,10 @@
 """Points, normals and tangent planes on meshes."""
 
+import numpy as np
 import pytest
 import torch
+import trimesh
+from primdiffusion.geometry import textured_mesh
 from primdiffusion.geometry.surface import (
     face_cross,
     signed_volume,
