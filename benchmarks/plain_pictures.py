@@ -21,9 +21,9 @@ And of the first --robust humans, camera error (camera_error_px_...) and PSNR (p
     pose_10, pose_20 joints turned by 10 and 20 degrees
     turned_10       the whole body turned by 10 degrees about the vertical besides
 
-`python benchmarks/plain_pictures.py spoiled --assets DIR --json F` measures some 40 spoiled pictures (--pictures)
-and six good ones of humans as in `upright.py`, by tilted cameras, from a standing start. They are not those by which limits
-were set. A fit is reported if it is below 85 % or left a part of the mask out:
+`python benchmarks/plain_pictures.py spoiled --assets DIR --json F` measures some 40 spoiled pictures (--pictures) and
+six good ones of humans as in `upright.py`, by tilted cameras, from a standing start. They are not those by which the
+limits were set. A fit is reported if it is below 85 % or left a part of the mask out:
 
     failed_fits_reported           share of the spoiled pictures (SPOILED) that are reported
     good_fits_reported             share of the good pictures that are reported though nothing is wrong
