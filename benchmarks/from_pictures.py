@@ -68,7 +68,8 @@ from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.reconstruction.from_captures import PriorFit, reconstruct, targets_of
+from primdiffusion.reconstruction.from_captures import reconstruct
+from primdiffusion.reconstruction.prior_fit import PriorFit, targets_of
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from record import command_line, report, run, surroundings

@@ -36,7 +36,8 @@ from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
-from primdiffusion.reconstruction.from_captures import reconstruct, targets_of
+from primdiffusion.reconstruction.from_captures import reconstruct
+from primdiffusion.reconstruction.prior_fit import targets_of
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march

@@ -46,6 +46,8 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("a picture without a camera: its joints", "plain_pictures", "camera_error_px", "px"),
         ("a picture of a tilted camera: lean of the torso, median", "upright", "lean_error_median_deg", "degrees"),
         ("the same: one foot's sole above the other, median", "upright", "feet_plane_median_cm", "cm"),
+        ("spoiled pictures whose fit says that it failed", "spoiled_pictures", "failed_fits_reported", ""),
+        ("a person cut out by the body posed over it: overlap", "spoiled_pictures", "cutout_iou", ""),
     ),
     "Generated humans": (
         ("a human, 30 steps", "diffusion", "generate_seconds_cpu", "s"),

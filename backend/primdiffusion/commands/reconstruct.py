@@ -32,7 +32,7 @@ from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer, V
 from primdiffusion.formats.requests import FitPostureRequest, Pictures, ReconstructRequest
 from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
-from primdiffusion.reconstruction.from_captures import FIT_STEPS, draw_humans, steps_of
+from primdiffusion.reconstruction.from_captures import HUMAN_STEPS, draw_humans, steps_of
 from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
 from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
 from primdiffusion.reconstruction.posture_start import write_posture
@@ -193,10 +193,10 @@ def _files(request: Pictures) -> tuple[Any, ...]:
 def _steps(report: ReportProgress, posture: bool, others: int = 0, humans: int = 0) -> Callable[[], None]:
     """Return a function to call after each step, which reports the work done and the seconds left.
 
-    `others`: `steps_of` the model, of which FIT_STEPS are repeated for each of the `humans`.
+    `others`: `steps_of` the model, of which HUMAN_STEPS are repeated for each of the `humans`.
     """
     work = [1] * (POSTURE_STEPS if posture else 0)
-    work += [START_WORK] * (others - FIT_STEPS) + [FIT_WORK] * (FIT_STEPS * humans if others else 0)
+    work += [START_WORK] * (others - HUMAN_STEPS) + [FIT_WORK] * (HUMAN_STEPS * humans if others else 0)
     done, began = itertools.accumulate(work), time.perf_counter()
 
     def on_step() -> None:

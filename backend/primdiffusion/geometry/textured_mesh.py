@@ -10,8 +10,9 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from trimesh.geometry import mean_vertex_normals
-from trimesh.triangles import cross
+
+DEGENERATE_M2 = 1e-14
+"""Length of a sum of faces' normals, twice their areas, below which it has no direction."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,7 +66,11 @@ class TexturedPart:
 
 def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
     """Area-weighted unit normals, outwards; zero where there are no faces, or only degenerate ones."""
-    return np.asarray(mean_vertex_normals(len(vertices), faces, cross(vertices[faces])))
+    first, second = np.diff(vertices[faces], axis=1).swapaxes(0, 1)
+    of_faces = np.cross(first, second).repeat(3, axis=0)
+    sums = np.stack([np.bincount(faces.ravel(), of_face, len(vertices)) for of_face in of_faces.T], 1)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.divide(sums, length, out=np.zeros_like(sums), where=length > DEGENERATE_M2)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

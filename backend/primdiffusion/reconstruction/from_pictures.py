@@ -6,7 +6,9 @@ that then explain the pictures (`reconstruction`) give it the colours by which l
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +25,6 @@ from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.reconstruction.from_captures import PriorFit, targets_of
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
@@ -39,6 +40,7 @@ from primdiffusion.reconstruction.posture_start import (
     turned_to_camera,
     views_of,
 )
+from primdiffusion.reconstruction.prior_fit import Explanation, PriorFit, targets_of
 from primdiffusion.render.image import PosedView
 
 
@@ -59,9 +61,13 @@ OUTLINE_SIDE = 64
 """Of the pictures that choose how a standing body stands."""
 LIKELY_START, LIKELY = 1.8, 1.5
 """How much worse than the best an outline may be for a turn of the body to be tried, and after the first round."""
+STANCES_TRIED = 3
+"""In a single picture; the first round leaves one."""
 FRONT = 30.0
 """Logarithm of how much more probable a picture from the front is than one from behind: most people show their face,
 and colours tell less before the pose is found exactly."""
+OWN_COLOURS = Stage(20, 0.03, upright=False)
+"""Before turns are told by colours, with those of each: limbs that are elsewhere would count more than a face."""
 TURN_STEPS = 3
 """Gauss-Newton steps on coefficients whose evidence tells the turns that are left: a face from hair."""
 OUTLINE_IN_PICTURE = 256
@@ -130,8 +136,7 @@ def person_in_pictures(
     elif not start.complete:
         raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
     else:
-        targets = _targets(photographs, start.posture, ROUNDS[-1].side)
-        found = Found(start.posture, _cut_out(_mean_human(model), photographs, targets))
+        found = Found(start.posture, _cut_out_twice(model, photographs, start.posture))
     if pose is None:
         facing = ", facing the camera" if len(photographs) == 1 else ""
         warnings.append(f"no pose was given: the person is taken to stand upright{facing}")
@@ -186,17 +191,18 @@ def start_of(
 def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, turned: bool) -> list[Posture]:
     """Standing bodies of the turns that fit the outline nearly as well as the best, each in its best stance.
 
-    Not `turned`: a single picture shows a person from the front; outlines tell front from back too seldom.
+    Not `turned`: a single picture shows a person from the front, in one of several stances; outlines tell front from
+    back too seldom.
     """
     payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
-    for degrees, stances in STANCES.items() if turned else [(0, STANCES[0])]:
+    for degrees, stances in STANCES if turned else STANCES[:1]:
         tried = []
         for stance in stances:
-            pose = standing(*stance, degrees)
+            pose = standing(*stance, turned=degrees)
             lens = photograph.lens() if view is None else view
             posture = Posture(pose, betas, framed([photograph], pose, betas, [lens]))
             tried.append((outline_error(payload, *_targets([photograph], posture, OUTLINE_SIDE)), posture))
-        found.append(min(tried, key=lambda one: one[0]))
+        found += sorted(tried, key=lambda one: one[0])[: 1 if turned else STANCES_TRIED]
     likely = [found[one][1] for one in _likely([error for error, _ in found], [0] * len(found), LIKELY_START)]
     return likely if view is None else [before_cameras(one, cameras_of([photograph], [view])) for one in likely]
 
@@ -233,10 +239,13 @@ def fit_posture_in(
         fit.refine(payload, targets(side), stage, on_step, shaped=not several)  # a wrong turn would bend the shape
         if several:
             if coefficient_steps:
-                away = FRONT * (1 - fit.posture().facing) / 2
-                kept = _likely([_misfit(components, one) for one in targets(side)] + away.numpy(), pictures)
+                facing = fit.posture().facing.tolist()
+                errors, seen = _seen_closely(components, fit, [photographs[one] for one in pictures], side)
+                alone = [error + FRONT * (1 - away) / 2 for error, away in zip(errors, facing, strict=True)]
+                kept = _explained(components, seen, pictures, alone)
             else:
-                kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, LIKELY)
+                share = LIKELY if len(photographs) > 1 else 1.0
+                kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, share)
             fit.keep(kept)
             pictures = [pictures[one] for one in kept]
         for _ in range(coefficient_steps):
@@ -254,12 +263,53 @@ def _likely(errors: Sequence[float] | np.ndarray, pictures: Sequence[int], share
     return [one for one, own in pairs if one == least[own] or errors[one] < share * errors[least[own]]]
 
 
-def _misfit(components: PriorFit, target: PosedView) -> float:
-    """How badly people of any colours explain a picture: a face tells front from back."""
+def _seen_closely(
+    components: PriorFit, fit: PostureFit, photographs: Sequence[Photograph], side: int
+) -> tuple[list[float], list[PosedView]]:
+    """How badly a person explains each picture alone, and the picture with the boxes that explain it better: those of
+    the fit, or after some steps more with the colours of that person.
+    """
+    targets, closer = _targets(photographs, fit.posture(), side), copy.deepcopy(fit)
+    people = [_person_in(components, [one]) for one in targets]
+    own = [components.payload(components.coefficients(one)) for one in people]
+    closer.refine(own, targets, OWN_COLOURS, shaped=False)
+    errors, seen = [], []
+    for before, *pair in zip(people, targets, _targets(photographs, closer.posture(), side), strict=True):
+        both = [-before.evidence, -_person_in(components, pair[1:]).evidence]
+        errors.append(min(both))
+        seen.append(pair[both.index(min(both))])
+    return errors, seen
+
+
+def _explained(
+    components: PriorFit, targets: Sequence[PosedView], pictures: Sequence[int], alone: Sequence[float]
+) -> list[int]:
+    """Numbers of the turns that explain the pictures best, one for each; `alone`: how badly each does for itself.
+
+    Pictures are decided one after the other, the clearest first; each has to show the same person as those before.
+    """
+    turns = [[one for one, own in enumerate(pictures) if own == picture] for picture in sorted(set(pictures))]
+
+    def doubt(numbers: list[int]) -> float:
+        best, *others = sorted(alone[one] for one in numbers)
+        return best - others[0] if others else -math.inf
+
+    kept: list[int] = []
+    for numbers in sorted(turns, key=doubt):
+        errors = dict(enumerate(alone))
+        if kept and len(numbers) > 1:
+            before = [targets[one] for one in kept]
+            errors = {one: -_person_in(components, [*before, targets[one]]).evidence for one in numbers}
+        kept.append(min(numbers, key=errors.__getitem__))
+    return sorted(kept)
+
+
+def _person_in(components: PriorFit, targets: Sequence[PosedView]) -> Explanation:
+    """The person of any colours that explains pictures best: a face tells front from back."""
     people = components.everyone()
     for _ in range(TURN_STEPS):
-        people = components.closer(people, [target])
-    return -people.evidence
+        people = components.closer(people, targets)
+    return people
 
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
@@ -274,6 +324,20 @@ def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Seque
     """The photographs; the persons of those without a mask are cut out again, by the human's outline."""
     pairs = zip(photographs, targets, strict=True)
     return [one if one.uncut is None else cut_by_outline(payload, one, target) for one, target in pairs]
+
+
+def _cut_out_twice(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> Sequence[Photograph]:
+    """As `_cut_out`, by the mean human and then by one with the colours and clothes of the first cut."""
+    if all(one.uncut is None for one in photographs):
+        return photographs
+    components = PriorFit.of(model)
+    people = components.everyone()
+    for round_ in ROUNDS[:2]:
+        for _ in range(round_.coefficient_steps):
+            people = components.closer(people, _targets(photographs, posture, round_.side))
+        payload = components.payload(components.coefficients(people))
+        photographs = _cut_out(payload, photographs, _targets(photographs, posture, ROUNDS[-1].side))
+    return photographs
 
 
 def _mean_human(model: DiffusionModel) -> Payload:

@@ -31,6 +31,7 @@ from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.descent import Adam
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
@@ -116,8 +117,10 @@ NEEDED = 3.0
 fall as those of Geman and McClure."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
-RATE = 0.15
-"""Step of Adam, standard deviations, which falls to a fifth."""
+RATE, LAST_RATE = 0.15, 0.2
+"""Step of Adam, standard deviations, and the share of it that is left at the end."""
+BETAS = (0.8, 0.95)
+"""Adam's decay rates."""
 COARSE = MarchSettings(step=0.008)
 
 
@@ -203,7 +206,7 @@ class PostureFit:
 
     def refine(
         self,
-        payload: Payload,
+        payload: Payload | Sequence[Payload],
         targets: Sequence[PosedView],
         stage: Stage,
         on_step: Callable[[], None] | None = None,
@@ -212,31 +215,29 @@ class PostureFit:
     ) -> None:
         """Move to where the human's primitives look most like the pictures; deterministic on one machine.
 
-        `targets` are of one size, and their cameras those of the posture so far, scaled; their frames do not count.
+        The human has one payload, or one in each picture. `targets` are of one size, and their cameras those of the
+        posture so far, scaled; their frames do not count.
         `on_step` is called after each step; an exception that it raises cancels. `shaped`: betas move too.
         """
         upright = self._tilted and stage.upright
         unknowns = [self._turn, self._move, self._lens, *[self._shape] * shaped, *[self._tilt] * upright]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
+        payloads = [payload] * len(targets) if isinstance(payload, Payload) else payload
         pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
         for value in unknowns:
             value.requires_grad_()
-        optimiser = torch.optim.Adam(unknowns, RATE, betas=(0.8, 0.95))
-        schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.2, stage.steps)
+        adam = Adam.of(unknowns, BETAS)
         for step in range(stage.steps):
-            optimiser.zero_grad()
             blur = stage.blur * max(first.width, first.height) * 0.5 ** (step / stage.steps)
             posture = self._posture()
-            seen = zip(posture.frames(), each(resized(posture.camera, scale, first)), pictures, strict=True)
-            errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
+            seen = zip(posture.frames(), payloads, each(resized(posture.camera, scale, first)), pictures, strict=True)
+            errors = [_difference(*one, blur) for one in seen]
             prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
             if upright:
                 prior = prior + (self._weights * _deviations(posture).square()).sum() / 2
             loss = EVIDENCE * torch.stack(errors).sum() + prior
-            loss.backward()
-            optimiser.step()
-            schedule.step()
+            adam.step(torch.autograd.grad(loss, unknowns), RATE * (1 - (1 - LAST_RATE) * step / stage.steps))
             if on_step is not None:
                 on_step()
         for value in unknowns:

@@ -23,9 +23,9 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.reconstruction.from_captures import PriorFit
 from primdiffusion.reconstruction.posture_fit import COARSE, Posture, each
 from primdiffusion.reconstruction.posture_masks import grown, unexplained
+from primdiffusion.reconstruction.prior_fit import PriorFit
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 
@@ -33,11 +33,13 @@ LEAST_PERCENT = 85
 """A fit below has probably failed; one of `LIMITS` is reached."""
 LIMITS: Mapping[str, float] = {
     "outline": 0.03,
-    "colour": 0.08,
+    "colour": 0.09,
     "unexplained": 0.03,
     "left_out": 0.1,
     "outside": 0.28,
-    "hand": 0.115,
+    "foot": 0.2,
+    "hand": 0.13,
+    "head": 0.06,
     "joint": 1.0,
 }
 """Values that fits of whole people in good masks stay below (`benchmarks/plain_pictures.py --spoiled`)."""
@@ -45,8 +47,10 @@ COLOUR_STEPS = 2
 """Gauss-Newton steps to the person coefficients that draw the colours."""
 EDGE_PX = 1
 """Difference of outlines that does not count, pixels of the small pictures that are compared."""
-PATTERN_PX = 7
-"""Side of the squares over which colours are compared, in the same pixels: patterns cannot be drawn."""
+PATTERN_PX, HEAD_PX = 11, 3
+"""Sides of the squares over which colours of the figure and of its head are compared, in the same pixels: patterns and
+faces are not drawn exactly.
+"""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
 """How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {
@@ -56,9 +60,10 @@ LIMBS: Mapping[str, tuple[str, ...]] = {
         "hand": ("wrist", "hand"),
         "forearm": ("elbow", "wrist", "hand"),
         "lower leg": ("knee", "ankle", "foot"),
+        "foot": ("ankle", "foot"),
     }.items()
-}
-"""Ends of limbs, by the joints that move them."""
+} | {"head": ("head",)}
+"""Ends of limbs and the head, by the joints that move them."""
 
 
 class FitQuality(NamedTuple):
@@ -73,9 +78,13 @@ class FitQuality(NamedTuple):
     left_out: float
     """Share of the mask that was left out of the fit."""
     outside: float
-    """Share of a limb outside of the mask, the largest."""
+    """Share of a forearm or a lower leg outside of the mask, the largest."""
+    foot: float
+    """Share of a foot outside of the mask, the larger one."""
     hand: float
-    """Mean difference of encoded colour at a hand, the largest."""
+    """Mean difference of encoded colour at a hand, the larger one."""
+    head: float
+    """The same of means over small squares at the head."""
     joint: float
     """Angle of a knee or an elbow, by how far it can bend in that direction, the largest."""
     limb: str
@@ -112,7 +121,9 @@ class FitQuality(NamedTuple):
                 "unexplained": f"{100 * self.unexplained:.0f} % of the mask belongs to no body",
                 "left_out": "too much of the mask was left out",
                 "outside": f"the {self.limb} lies outside of the mask",
+                "foot": "a foot lies outside of the mask: it is hidden or cut off",
                 "hand": "a hand is not where the body has it: it is hidden, cut off, or seen from behind",
+                "head": "the head is not that of a person seen from the front",
                 "joint": "a knee or an elbow bends as it cannot",
             }[self.worst]
             warnings.append(
@@ -144,14 +155,18 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
     wrong = (mask & ~grown(drawn, EDGE_PX)) | (drawn & ~grown(mask, EDGE_PX))
     difference = encode_srgb(seen.rgb.clamp(1e-4, 1)) - encode_srgb(target.rgba[..., :3].clamp(1e-4, 1))
     differs, inner = difference.abs().mean(-1), (opacity > 0.9) & (seen.alpha > 0.9)
-    inside = _mean_around(difference, inner).abs().mean(-1)[inner]
-    outside, hand = {}, 0.0
+    inside = _mean_around(difference, inner, PATTERN_PX).abs().mean(-1)[inner]
+    of_head, outside, colour = _mean_around(difference, inner, HEAD_PX).abs().mean(-1), {}, {"head": 0.0}
     for limb, share in _limbs_drawn(payload, target).items():
         within = share * mask
         outside[limb] = 1 - float(within.sum() / share.sum().clamp_min(1e-6)) if share.sum() else 0.0
-        if limb.endswith("hand"):
-            hand = max(hand, float((within * differs).sum() / within.sum().clamp_min(1e-6)))
-            del outside[limb]  # a part of the forearm
+        weights, values = (share * inner, of_head) if limb == "head" else (within, differs)
+        colour[limb] = float((weights * values).sum() / weights.sum().clamp_min(1e-6))
+    hand, foot = (
+        max(values[f"{side} {part}"] for side in ("left", "right"))
+        for values, part in ((colour, "hand"), (outside, "foot"))
+    )
+    outside = {limb: share for limb, share in outside.items() if limb.endswith(("forearm", "lower leg"))}
     limb = max(outside, key=lambda name: outside[name])
     return FitQuality(
         outline=float(wrong.sum() / (mask | drawn).sum()),
@@ -159,16 +174,18 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
         unexplained=float(unexplained(seen.alpha, opacity).sum() / mask.sum()),
         left_out=left_out,
         outside=outside[limb],
+        foot=foot,
         hand=hand,
+        head=colour["head"],
         joint=_strain(pose),
         limb=limb,
     )
 
 
-def _mean_around(values: Float[Tensor, "H W 3"], inner: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+def _mean_around(values: Float[Tensor, "H W 3"], inner: Bool[Tensor, "H W"], side: int) -> Float[Tensor, "H W 3"]:
     """Means over the pixels of the figure in squares, in which stripes and checks are one colour."""
     weights = torch.cat([values * inner[..., None], inner[..., None].float()], -1).movedim(-1, 0)[None]
-    sums = torch.nn.functional.avg_pool2d(weights, PATTERN_PX, stride=1, padding=PATTERN_PX // 2)[0]
+    sums = torch.nn.functional.avg_pool2d(weights, side, stride=1, padding=side // 2)[0]
     return (sums[:3] / sums[3:].clamp_min(1e-6)).movedim(0, -1)
 
 

@@ -32,11 +32,18 @@ from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.human import pose_body
 from primdiffusion.reconstruction.posture_fit import Posture, each
 
-_RAISED = ((75.0, -60.0, 0.0), (-60.0, 75.0, 0.0))
-_ACROSS = (*((arms, arms, 0.0) for arms in (0.0, 30.0, 55.0, 75.0)), *_RAISED)
-_ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0, 0.0), *_RAISED)
-STANCES: Mapping[float, Sequence[tuple[float, float, float]]] = {0: _ACROSS, 90: _ALONG, 180: _ACROSS, 270: _ALONG}
-"""What a standing body may look like by the degrees that it is turned to its left: arms and stride of `standing`."""
+_RAISED = ((75.0, -60.0), (-60.0, 75.0))
+_ACROSS = (*((arms, arms) for arms in (0.0, 30.0, 55.0, 75.0)), (55.0, 55.0, 0.0, 96.0), *_RAISED)
+_ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0))
+STANCES: Sequence[tuple[float, Sequence[tuple[float, ...]]]] = (
+    (0, _ACROSS), (180, _ACROSS),
+    *((side, stances) for side in (90, 270) for stances in (_ALONG, *((raised,) for raised in _RAISED))),
+)  # fmt: skip
+"""What a standing body may look like: degrees that it is turned to its left, and arguments of `standing`, of which the
+best are tried. From the side, outlines do not tell which arm is raised.
+"""
+TWIST = 0.4
+"""Of an upper arm, by the angle of its elbow, where a hand is at the hip."""
 FRAMING_STEPS = 4
 """Distance and place are found together, because near parts look larger."""
 NEAREST, FARTHEST = 1.0, 1e3
@@ -111,14 +118,19 @@ def _at(camera: Camera, translation: Float[Tensor, "3"]) -> Camera:
     )
 
 
-def standing(left_arm: float, right_arm: float, stride: float = 0.0, turned: float = 0.0) -> BodyPose:
+def standing(
+    left_arm: float, right_arm: float, stride: float = 0.0, bent: float = 0.0, *, turned: float = 0.0
+) -> BodyPose:
     """An upright body [1] that faces +z, turned by so many degrees to its left.
 
-    Arms are lowered by degrees from the T pose; the left leg is lifted forward by `stride` degrees, the right one back.
+    Arms are lowered by degrees from the T pose, and bent by degrees that bring hands to the hips; the left leg is
+    lifted forward by `stride` degrees, the right one back.
     """
     theta = torch.zeros(1, len(JOINT_NAMES), 3)
     for joint, axis, degrees in (
         ("pelvis", 1, turned), ("left_shoulder", 2, -left_arm), ("right_shoulder", 2, right_arm),
+        ("left_shoulder", 0, TWIST * bent), ("right_shoulder", 0, TWIST * bent),
+        ("left_elbow", 1, -bent), ("right_elbow", 1, bent),
         ("left_hip", 0, -stride), ("right_hip", 0, stride),
     ):  # fmt: skip
         theta[0, JOINT_NAMES.index(joint), axis] = math.radians(degrees)

@@ -16,6 +16,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.adam import adam as adam_step
 
 from primdiffusion.formats.requests import Count, NotNegative, RayStep
 from primdiffusion.formats.schema import Checked, Range
@@ -87,8 +88,7 @@ def descend(
     leaves = _Leaves.of(start)
     first = [leaf.detach().clone() for leaf in leaves]
     groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
-    adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
-    fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
+    adams = [(Adam.of([leaf], BETAS), rate) for leaf, rate in groups]
     chosen = _chosen(views, settings)
     covered = sum(float(view.rgba[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
 
@@ -110,13 +110,37 @@ def descend(
         value = float(loss)
         if not math.isfinite(value):
             raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
-        for leaf, gradient in zip(leaves, found, strict=True):
-            leaf.grad = gradient
-        adam.step()
-        fall.step()
+        for (adam, rate), gradient in zip(adams, found, strict=True):
+            adam.step([gradient], rate * _share_of_rate(number - 1, settings))
         leaves.clamp_(settings.largest_density)
         on_step()
     return leaves.result(start)
+
+
+class Adam(NamedTuple):
+    """Adam (Kingma and Ba 2015) on some tensors, in place. Unlike `torch.optim.Adam` it does not load the compiler of
+    torch, which takes 150 MB and more than a second.
+    """
+
+    values: list[Tensor]
+    betas: tuple[float, float]
+    means: list[Tensor]
+    squares: list[Tensor]
+    steps: list[Tensor]
+
+    @classmethod
+    def of(cls, values: Sequence[Tensor], betas: tuple[float, float]) -> Adam:
+        """At its start."""
+        means, squares = ([torch.zeros_like(value, requires_grad=False) for value in values] for _ in range(2))
+        return cls(list(values), betas, means, squares, [value.new_zeros(()) for value in values])
+
+    @torch.no_grad()
+    def step(self, gradients: Sequence[Tensor], rate: float) -> None:
+        """Move the values against their gradients."""
+        adam_step(
+            self.values, list(gradients), self.means, self.squares, [], self.steps, fused=True, amsgrad=False,
+            beta1=self.betas[0], beta2=self.betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
+        )  # fmt: skip
 
 
 class _Leaves(NamedTuple):

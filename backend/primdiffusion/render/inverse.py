@@ -86,9 +86,9 @@ def fit_payload(
         np.concatenate([_linear_unit(first[:, :3], settings), np.full_like(first[:, 3:], full_density)], 1),
     )
     limit = np.array([1, 1, 1, full_density], np.float32)
-    for number in range(settings.steps):
-        z = z.clip(0, limit)
-        seen = targets if number == settings.steps - 1 else targets[number % 2 :: 2] or targets
+
+    def closer(z: ndarray, seen: Sequence[PosedView]) -> ndarray:
+        """After a step in these views; their matrices are large, and gone before the next."""
         views = [LinearisedView.of(target, _payload(z, start), settings) for target in seen]
         gradient, diagonal = np.zeros_like(z), np.zeros_like(z)
         jacobians, alpha_free = [view.jacobian for view in views], [view.alpha_free for view in views]
@@ -101,8 +101,11 @@ def fit_payload(
         gradient -= unit * (np.float32(settings.pull) * change + np.float32(settings.smoothness) * laplacian(change))
         held = ((z <= 0) & (gradient < 0)) | ((z >= limit) & (gradient > 0))
         penalty = _Penalty(unit, settings, diagonal, held)
+        return z + scale * conjugate_gradients(_curvature(views, scale), penalty, gradient, settings.iterations, _dot)
 
-        z = z + scale * conjugate_gradients(_curvature(views, scale), penalty, gradient, settings.iterations, _dot)
+    for number in range(settings.steps):
+        last = number == settings.steps - 1
+        z = closer(z.clip(0, limit), targets if last else targets[number % 2 :: 2] or targets)
     return _payload(z.clip(0, limit), start)
 
 

@@ -23,8 +23,7 @@ from primdiffusion.evaluation.metrics import psnr
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, body_of, pose_body
-from primdiffusion.people.payloads import rest_frames
-from primdiffusion.primitives.anchors import attach
+from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import DescentSettings, descend, render_view
@@ -145,14 +144,15 @@ def bare_body(betas: Float[Tensor, "n"]) -> Human:
     Raises ValueError for more betas than the body has.
     """
     body = default_body()
+    vertices = body.shape(betas).vertices
     skin = TexturedPart(
         name="body",
-        vertices=body.shape(betas).vertices.double().numpy(),
+        vertices=vertices.double().numpy(),
         faces=body.faces.numpy().astype(np.int32),
         corner_uv=body.uv[body.uv_faces].numpy(),
         texture=np.array([[GREY]], np.uint8),
         skin_index=np.zeros((len(body.template), 1), np.int32),
         skin_weight=np.ones((len(body.template), 1)),
     )
-    payload = from_mesh(TexturedMesh((skin,)), rest_frames(betas.double().numpy()))
+    payload = from_mesh(TexturedMesh((skin,)), attach(default_anchors(), vertices, body.faces))
     return Human(payload, betas, {"start": "the bare body"}).validate()

@@ -1,7 +1,10 @@
 """Points, normals and tangent planes on meshes."""
 
+import numpy as np
 import pytest
 import torch
+import trimesh
+from primdiffusion.geometry import textured_mesh
 from primdiffusion.geometry.surface import (
     face_cross,
     signed_volume,
@@ -87,3 +90,13 @@ def test_du_cross_dv_follows_the_face_normal_whatever_the_chart(uv):
     du, dv = (weights[0] @ corners for weights in uv_gradient(torch.tensor(uv, dtype=torch.float64), faces))
     normal = torch.nn.functional.normalize(torch.linalg.cross(du, dv), dim=0)
     assert torch.allclose(normal, torch.nn.functional.normalize(face_cross(corners, faces)[0], dim=0))
+
+
+def test_normals_of_vertices_are_those_of_trimesh_and_zero_without_faces():
+    draws = np.random.default_rng(0)
+    vertices, faces = draws.normal(size=(9, 3)), draws.permuted(np.tile(np.arange(8), (12, 1)), axis=1)[:, :3]
+    faces[0] = faces[0, 0]
+    normals = textured_mesh.vertex_normals(vertices, faces)
+    crosses = trimesh.triangles.cross(vertices[faces])
+    assert np.allclose(normals, trimesh.geometry.mean_vertex_normals(len(vertices), faces, crosses), atol=1e-12)
+    assert not normals[8].any()

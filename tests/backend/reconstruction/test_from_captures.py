@@ -17,16 +17,8 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
 from primdiffusion.primitives.primitives import Payload, Primitives, S
 from primdiffusion.reconstruction import from_captures
-from primdiffusion.reconstruction.from_captures import (
-    FIT_STEPS,
-    OBSERVATIONS,
-    PIXEL_STD,
-    PriorFit,
-    encode_and_fit,
-    reconstruct,
-    steps_of,
-    targets_of,
-)
+from primdiffusion.reconstruction.from_captures import HUMAN_STEPS, encode_and_fit, reconstruct, steps_of
+from primdiffusion.reconstruction.prior_fit import OBSERVATIONS, PIXEL_STD, PriorFit, targets_of
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
@@ -115,7 +107,7 @@ def test_smaller_pictures_are_what_their_cameras_see():
 def test_every_step_is_reported_and_an_exception_cancels():
     person, steps = captured(human_of(COLOURS), BodyPose.rest(), [0.0]), []
     reconstruct(MODEL, person, on_step=lambda: steps.append(None))
-    assert len(steps) == steps_of(MODEL) > FIT_STEPS
+    assert len(steps) == steps_of(MODEL) > HUMAN_STEPS
     assert steps_of(tiny_encoder()) == 0
 
     def cancel() -> None:
@@ -172,7 +164,7 @@ def test_kinds_within_people_explain_pictures_as_their_gaussian_does():
         **parts, basis=PRIOR.basis.mT.flatten(1), log_weight=torch.full((2, 2), 0.25).log(), centre=group,
         axes=PRIOR.axes.repeat(2, 1, 1), variance=variance, kind=PRIOR.kind.repeat(2, 1, 1),
     )  # fmt: skip
-    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior, _latest=[None, None])
+    components = dataclasses.replace(PriorFit.of(MODEL), prior=prior)
     human = human_of(COLOURS / 10)
     targets = targets_of(captured(human, BodyPose.rest(), [0.0]).views, [frames_of(human)], 64)
     everyone = components.everyone()

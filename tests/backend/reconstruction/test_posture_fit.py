@@ -34,6 +34,7 @@ from primdiffusion.reconstruction.posture_start import (
     views_of,
     write_posture,
 )
+from primdiffusion.reconstruction.prior_fit import Explanation
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 from support.errors import refused
@@ -285,6 +286,41 @@ def test_a_person_is_found_from_any_side_in_each_picture(monkeypatch):
     for rotation, turned in zip(found.pose.joint_rotation[:, 0], turns, strict=True):
         off = math.degrees(math.atan2(rotation[0, 2], rotation[2, 2])) - turned
         assert abs((off + 180) % 360 - 180) < 15
+
+
+def test_turns_are_those_of_one_person_in_all_pictures(monkeypatch):
+    """The first picture is a clear front; the second alone looks like one too, but not of the same person."""
+    alone, together = [0.0, 120.0, 50.0, 90.0], {(0, 2): 300.0, (0, 3): 200.0}
+
+    def person_in(_, targets):
+        return Explanation(None, None, torch.zeros(0), -together[tuple(targets)])
+
+    monkeypatch.setattr(from_pictures, "_person_in", person_in)
+    assert from_pictures._explained(None, range(4), [0, 0, 1, 1], alone) == [0, 3]
+    assert from_pictures._explained(None, range(2), [0, 0], alone[2:]) == [0]
+
+
+def test_each_arm_may_be_raised_in_a_picture_from_the_side():
+    """The outline is the same, and colours decide."""
+    rgba = np.zeros((96, 96, 4), np.uint8)
+    posture = Posture(standing(60.0, -45.0, 10.0, turned=100.0), torch.zeros(10), None)
+    (frames,) = posture.frames()
+    with torch.no_grad():
+        picture = march(Primitives.place(frames, PAYLOAD), framing(Primitives.place(frames, PAYLOAD), 0.0, 96, 96))
+    rgba[..., 3] = (255 * picture.alpha).byte()
+    photograph = Photograph(Path("a.png"), rgba, Window(0, 0, 96, 96), 96, 96, None)
+    start = from_pictures.start_of([photograph, photograph], MODEL)
+    joints = [pose_body(start.posture.betas, pose).joints[:, 1, 3] for pose in each(start.posture.pose)]
+    left, right = (torch.stack(joints)[:, JOINT_NAMES.index(f"{side}_wrist")] for side in ("left", "right"))
+    assert (left > right + 0.5).any()
+    assert (right > left + 0.5).any()
+
+
+def test_hands_of_bent_arms_are_at_the_hips():
+    body = default_body().shape(torch.zeros(10)).pose(standing(55.0, 55.0, 0.0, 96.0))
+    for side in ("left", "right"):
+        hand, hip = (body.joints[0, JOINT_NAMES.index(f"{side}_{name}"), :3, 3] for name in ("wrist", "hip"))
+        assert (hand - hip).norm() < 0.3
 
 
 def test_arms_of_a_standing_body_are_lowered():

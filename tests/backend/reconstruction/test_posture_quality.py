@@ -14,12 +14,12 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import framing
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.reconstruction.from_captures import PriorFit
 from primdiffusion.reconstruction.from_pictures import Found, fit_quality
 from primdiffusion.reconstruction.posture_fit import Posture
 from primdiffusion.reconstruction.posture_masks import without_things
 from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, FitQuality
 from primdiffusion.reconstruction.posture_start import standing
+from primdiffusion.reconstruction.prior_fit import PriorFit
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
 from support.tiny import tiny_model
@@ -27,7 +27,7 @@ from support.tiny import tiny_model
 MODEL, SIDE = tiny_model(), 96
 COMPONENTS = PriorFit.of(MODEL)
 PAYLOAD = COMPONENTS.payload(COMPONENTS.coefficients(COMPONENTS.everyone()))
-NONE = FitQuality(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "left forearm")
+NONE = FitQuality(**dict.fromkeys(LIMITS, 0.0), limb="left forearm")
 
 
 def a_posture() -> Posture:
@@ -115,6 +115,25 @@ def test_a_leg_that_the_mask_lacks_is_a_failed_fit_that_names_it():
     assert found.percent < LEAST_PERCENT
     assert found.outside > 0.9
     assert found.limb == "left lower leg"
+
+
+def test_a_foot_that_the_mask_lacks_is_a_failed_fit():
+    photograph, target = seen()
+    rgba, rows = photograph.rgba.copy(), np.flatnonzero(target.rgba[..., 3].any(1).numpy())
+    rgba[rows[-1] - 4 :, : SIDE // 2] = 0
+    found = quality(dataclasses.replace(photograph, rgba=rgba))
+    assert found.worst == "foot"
+    assert "a foot lies outside of the mask" in found.warnings()[0]
+
+
+def test_a_head_of_other_colours_is_a_failed_fit():
+    photograph, target = seen()
+    rgba, rows = photograph.rgba.copy(), np.flatnonzero(target.rgba[..., 3].any(1).numpy())
+    head = slice(rows[0], rows[0] + len(rows) // 8)
+    rgba[head, :, :3] = rgba[head, :, 3:]
+    found = quality(dataclasses.replace(photograph, rgba=rgba))
+    assert found.head > LIMITS["head"]
+    assert found.head > 3 * quality(photograph).head
 
 
 @pytest.mark.parametrize(

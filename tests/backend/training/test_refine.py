@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.primitives import K, Payload, S
-from primdiffusion.render.descent import DescentSettings
+from primdiffusion.render.descent import Adam, DescentSettings
 from primdiffusion.render.march import march
 from primdiffusion.training.refine import bare_body, refine, view_psnr
 from support.errors import refused
@@ -258,3 +260,31 @@ def test_a_bare_body_takes_on_the_captured_one_s_colours(tmp_path):
         reached = float(view_psnr(refined, judged).mean())
         assert reached > least
         assert reached > float(view_psnr(start, judged).mean()) + 5
+
+
+def test_adam_is_that_of_torch():
+    values = torch.randn(2, 5, generator=torch.Generator().manual_seed(0))
+    own, theirs = ([value.clone().requires_grad_() for value in values] for _ in range(2))
+    adam, torchs = Adam.of(own, (0.7, 0.9)), torch.optim.Adam(theirs, betas=(0.7, 0.9))
+    for rate in (0.3, 0.2, 0.1):
+        torchs.param_groups[0]["lr"] = rate
+        torchs.zero_grad()
+        torch.stack(theirs).pow(4).sum().backward()
+        torchs.step()
+        adam.step(torch.autograd.grad(torch.stack(own).pow(4).sum(), own), rate)
+    assert torch.allclose(torch.stack(own), torch.stack(theirs), atol=1e-6)
+    assert (torch.stack(own) - values).abs().min() > 0.1
+
+
+def test_a_fit_loads_neither_the_compiler_of_torch_nor_trimesh():
+    """They take 190 MB, a sixth of what a human from a picture takes."""
+    code = """
+import sys, torch
+from primdiffusion.commands import reconstruct
+from primdiffusion.render.descent import Adam
+value = torch.zeros(1, requires_grad=True)
+Adam.of([value], (0.7, 0.9)).step(torch.autograd.grad(value.sum(), [value]), 0.1)
+print({"torch._dynamo", "trimesh", "networkx"} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
