@@ -51,8 +51,7 @@ class DecoderObjective:
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted error of a random batch."""
-        clean = torch.zeros(self.config.batch, dtype=torch.int64)
-        weights, indices = blends(self.people, clean, self.config.blend, generator)
+        weights, indices = blends(self.people, self.config.batch, self.config.blend, generator)
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), generator=generator) < 0.5
         z[flip] = self.codec.mirror(z[flip])
