@@ -34,7 +34,7 @@ from primdiffusion.people.payloads import (
     voxels_from_payload,
 )
 from primdiffusion.people.person import Person, make_person, recolour
-from primdiffusion.people.stored_people import PersonVariants, read_person
+from primdiffusion.people.stored_people import PersonVariants, read_payloads
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
@@ -214,4 +214,4 @@ def recoloured(person: Person, number: int, count: int) -> list[Person]:
 
 def stored_fit(folder: Path, number: int) -> PersonVariants:
     """A held-out person's fitted payload from its file."""
-    return read_person(folder / f"person_{FIRST_SEED + number:06d}.npz")
+    return read_payloads(folder / f"person_{FIRST_SEED + number:06d}.npz")

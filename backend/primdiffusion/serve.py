@@ -13,6 +13,7 @@ closes, because its parent has exited. File descriptor 1 is redirected to stderr
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import math
@@ -24,7 +25,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
-from primdiffusion.commands import FUNCTIONS, function_of
+from primdiffusion.commands import FUNCTIONS, function_of, open_session
 from primdiffusion.files.json_files import LARGEST_BYTES, parse_message
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
@@ -256,10 +257,8 @@ class Server:
     def _warm_up(self) -> Session | RpcError:
         """Import torch and what needs it; an import error becomes the error of every later request."""
         try:
-            # after `hello` can be answered; the other two are loaded before the first request
-            from primdiffusion.commands import output, render, session  # noqa: F401
-
-            started = session.Session()
+            started = open_session()
+            function_of("render")  # loads what most requests need before the first one
         except Exception as e:
             error = _as_rpc_error(e)
             self._state = Ready(problem=str(error))
@@ -342,16 +341,10 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
     return os.fdopen(source, "rb"), os.fdopen(sink, "wb")
 
 
-@dataclasses.dataclass(frozen=True)
-class ServeCommand:
-    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
-
-
 def run(arguments: Sequence[str]) -> None:
-    """`primdiffusion serve`."""
-    from primdiffusion.commands.command_line import parse  # the child does not need tyro
-
-    parse(ServeCommand, arguments, "serve")
+    """`primdiffusion serve`, which has no options."""
+    about = "Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."
+    argparse.ArgumentParser("primdiffusion serve", description=about).parse_args(arguments)
     main()
 
 

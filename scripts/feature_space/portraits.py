@@ -22,7 +22,7 @@ from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.people.stored_people import read_outline, read_person
+from primdiffusion.people.stored_people import read_outline, read_payloads
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.march import MarchSettings, march
@@ -120,7 +120,7 @@ def payload_sources(paths: Sequence[Path]) -> list[Source]:
     """Payload files, drawn by the marcher."""
 
     def draw(path: Path) -> UInt8[Tensor, "n v h w 4"]:
-        person = read_person(path)
+        person = read_payloads(path)
         frames = rest_frames(person.betas.numpy())
         return torch.stack(
             [portraits(Primitives.place(frames, person.payload(number))) for number in range(len(person.voxels))]

@@ -7,7 +7,7 @@ import torch
 from diffusion_people import write_people
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.people.stored_people import find_people
+from primdiffusion.people.stored_people import find_payloads
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
@@ -51,14 +51,14 @@ def reference_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def reference(people, reference_folder):
-    train, held = split_people(find_people(people), 0.34, 0)
+    train, held = split_people(find_payloads(people), 0.34, 0)
     sources = [payload_sources(paths) for paths in (train, held)]
     train_reference(*sources, reference_folder)
     return open_reference_set(*sources, reference_folder)
 
 
 def test_portraits_of_stored_people_are_kept_and_not_drawn_again(people, tmp_path):
-    paths = find_people(people)[:2]
+    paths = find_payloads(people)[:2]
     first = open_gallery(payload_sources(paths), tmp_path)
     again = open_gallery([Source(path.name, never, never) for path in paths], tmp_path)
     assert torch.equal(first.pictures, again.pictures)
@@ -100,7 +100,7 @@ def test_people_far_from_all_real_ones_are_far_and_not_precise(reference):
 
 
 def test_reference_set_is_read_back_from_its_folder(people, reference, reference_folder):
-    train, held = split_people(find_people(people), 0.34, 0)
+    train, held = split_people(find_payloads(people), 0.34, 0)
     again = open_reference_set(
         *([Source(path.name, never, never) for path in paths] for paths in (train, held)), reference_folder
     )

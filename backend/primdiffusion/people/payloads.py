@@ -92,13 +92,13 @@ def make_payloads(
     done = count - len(jobs)
     report(done, count)
     work = [(assets, path, variants, person_seed, making, checkpoint) for path, person_seed in jobs]
-    for _ in each(write_person, work, workers):
+    for _ in each(write_payloads, work, workers):
         done += 1
         report(done, count)
     return paths
 
 
-def write_person(
+def write_payloads(
     assets: Assets, path: Path, variants: int, seed: int, making: Making, checkpoint: Path | None = None
 ) -> None:
     """Generate one sample in all colourings and write its file, atomically."""
@@ -118,7 +118,7 @@ def write_person(
         "seed": seed,
         "making": _method(making, checkpoint),
     }
-    store_person(path, entries)
+    store_payloads(path, entries)
 
 
 @functools.lru_cache(maxsize=1)
@@ -138,7 +138,7 @@ def coloured_people(assets: Assets, seed: int, variants: int) -> list[Person]:
     return [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
 
 
-def store_person(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
+def store_payloads(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
     """Write a payload file, atomically, with `full_density` added. Raises OSError, which names the file."""
     with written_whole(path) as unfinished:
         write_deflated(

@@ -22,7 +22,7 @@ from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
-from primdiffusion.people.stored_people import read_person
+from primdiffusion.people.stored_people import read_payloads
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.released.imported import Reference, reference_extents
@@ -159,7 +159,7 @@ def test_payloads_are_encoded_with_it(folder, encoder_file):
     out = folder / "payloads"
     cli.run(["payloads", "encode", "--captures", str(folder / "captures"), "--encoder", str(encoder_file),
              "--out", str(out), "--views", "2", "--looks", "2"])  # fmt: skip
-    stored = read_person(out / "someone.npz")
+    stored = read_payloads(out / "someone.npz")
     assert stored.voxels.shape == (2, K, S, S, S, 4)
     model = load_encoder(encoder_file)
     person = captured_person(folder / "captures", views=2, body=model.body)
