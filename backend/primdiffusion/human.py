@@ -49,7 +49,11 @@ FRAMING_MARGIN = 1.04
 
 @dataclasses.dataclass(frozen=True)
 class Human(TensorRecord):
-    """One human, independent of pose: the payload of the primitives and the shape of the body they are attached to."""
+    """One human, independent of pose: the payload of the primitives and the shape of the body they are attached to.
+
+    >>> human.validate().betas.shape
+    torch.Size([10])
+    """
 
     payload: Payload
     """Unbatched."""

@@ -11,7 +11,7 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.render import RenderJob, render, set_up_capture, set_up_together
+from primdiffusion.capture.render import set_up_capture, set_up_together
 from primdiffusion.captured_humans import VolumetricPerson, find_subjects, read_subject, renderer_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
@@ -169,24 +169,6 @@ def test_pycocotools_reads_a_generated_humans_masks_and_keypoints(whole):
         inside = stored[tuple((keypoints[:, 1::-1] + 0.5).astype(int).T)] >= 128
         assert inside.sum() >= 15
         assert annotation["smpl"]["betas"] == [1.0, -1.0] + [0.0] * 8
-
-
-def test_interrupted_captures_go_on_to_the_same_bytes_and_two_workers_write_them_too(whole, tmp_path):
-    before = everything(whole / "captures")
-    lost = capture_layout.picture_path(whole / "captures" / "ada", "depth", 2, 1)
-    lost.unlink()
-    (whole / "captures" / "ada" / capture_layout.COMPLETE_FILE).unlink()
-    cli.main(words(whole))
-    after = everything(whole / "captures")
-    assert {name for name in before if before[name] != after[name]} <= {"report.json"}
-    job = RenderJob(
-        {"ada": whole / "people" / "ada.human"}, poses(), tmp_path / "captures",
-        Rig(count=CAMERAS, width=SIZE, height=SIZE), ("img", "mask", "depth"),
-        read=read_subject, renderer="marcher",
-    )  # fmt: skip
-    assert [outcome.status for outcome in render(job, workers=2)] == ["done"]
-    again = everything(tmp_path / "captures" / "ada")
-    assert all(before[f"ada/{name}"] == content for name, content in again.items())
 
 
 def test_a_generated_human_stands_beside_a_mesh(tmp_path):

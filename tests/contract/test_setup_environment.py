@@ -205,13 +205,6 @@ def test_a_python_that_cannot_make_an_environment_is_named(place, tmp_path, monk
     assert "No module named venv" in place.folder.log.read_text()
 
 
-def test_a_damaged_list_of_packages_is_an_error_before_anything_is_made(place):
-    place.lock.write_text("torch\n")
-    with refused(ValueError, "line 1"):
-        place.steps()
-    assert not place.folder.environment.exists()
-
-
 ROOT = Path(__file__).parents[2]
 
 

@@ -100,7 +100,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=6)))
 
 @pytest.mark.parametrize("folder", ["img", "outputs_re_fitting", ""])
 def test_no_worker_writes_through_a_link_in_the_folder_of_a_human(tmp_path, folder):
-    outside, job = tmp_path / "outside", small_job(tmp_path)
+    outside, job = tmp_path / "outside", small_job(tmp_path, people=1)
     outside.mkdir()
     capture_layout.claim(job.out, job.about)
     (job.out / NAMES[0] / folder).parent.mkdir(exist_ok=True)

@@ -199,12 +199,6 @@ def test_weights_that_half_precision_cannot_hold_replace_no_file(saved, tmp_path
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_configurations_come_back_from_json(preset):
-    config = PRESETS[preset]
-    assert config_from_json(json.loads(json.dumps(dataclasses.asdict(config)))) == config
-
-
 def test_unknown_and_missing_settings_are_rejected_by_name():
     tree = dataclasses.asdict(TINY)
     with refused(ValueError, "colour_of_eyes"):

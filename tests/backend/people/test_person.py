@@ -1,7 +1,6 @@
 """Whole people: these need a MakeHuman asset folder and skip without one."""
 
 import json
-import os
 
 import numpy as np
 import pytest
@@ -292,20 +291,3 @@ def test_fits_look_more_like_the_mesh_from_sides_not_shown_and_from_a_guess_leav
 def test_counts_that_make_nothing_are_rejected(tmp_path):
     with refused(ValueError, "variants is 0"):
         make_payloads(assets_module.Assets(tmp_path), tmp_path, 1, 0, 0, 1)
-
-
-@pytest.mark.slow
-def test_processes_make_the_same_files_as_one(assets, tmp_path):
-    environment = dict(os.environ)
-    alone = make_payloads(assets, tmp_path / "one", 3, 1, 11, 1, "from_mesh")
-    reports = []
-    together = make_payloads(
-        assets, tmp_path / "two", 3, 1, 11, 2, "from_mesh", report=lambda done, total: reports.append(done)
-    )
-    assert [path.name for path in together] == [path.name for path in alone]
-    assert reports[0] == 0
-    assert reports[-1] == 3
-    assert dict(os.environ) == environment
-    for first, second in zip(alone, together, strict=True):
-        with np.load(first) as a, np.load(second) as b:
-            assert np.array_equal(a["voxels"], b["voxels"])

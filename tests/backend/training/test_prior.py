@@ -7,7 +7,9 @@ import dataclasses
 import pytest
 import torch
 from primdiffusion.diffusion.codec import mirror_cells
+from primdiffusion.people.stored_people import find_payloads
 from primdiffusion.primitives.primitives import GRID
+from primdiffusion.training.latents import split_people
 from primdiffusion.training.prior import fit_prior
 
 
@@ -56,3 +58,13 @@ def test_person_components_live_in_the_leading_channels_alone(prepared_once):
     assert torch.equal(rest[:, 2:], z[:, 2:] - prior.mean[2:])
     assert torch.allclose(prior.join(coefficients, rest), z, atol=1e-4)
     assert (prior.split(prior.join(coefficients, torch.zeros_like(rest)))[0] - coefficients).abs().max() < 1e-3
+
+
+def test_held_out_geometries_are_never_trained_on(people):
+    paths = find_payloads(people)
+    train_paths, held = split_people(paths, 0.2, seed=0)
+    assert len(held) == 3
+    assert set(train_paths).isdisjoint(held)
+    assert sorted(train_paths + held) == paths
+    assert split_people(paths, 0.2, seed=0) == (train_paths, held)
+    assert split_people(paths, 0.2, seed=1)[1] != held
