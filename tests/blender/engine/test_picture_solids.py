@@ -8,7 +8,7 @@ import pytest
 from engine_stage import add_human, cube, material, render_png, set_up_render
 from support.errors import refused
 
-from blender_primdiffusion.engine.picture import SceneSolids, base_colour, changed_by, scene_solids, stored
+from blender_primdiffusion.engine.picture import base_colour, changed_by, scene_solids, stored
 from blender_primdiffusion.scene.human import body_of
 
 
@@ -218,22 +218,3 @@ def test_every_view_shows_the_person_in_its_own_way(pair, view):
     assert np.abs(picture - colour).max() > 50
     if view == "ALPHA":
         assert np.abs(picture[..., 0] - colour[..., 3]).max() <= 1
-
-
-@pytest.mark.any_blender
-def test_links_in_place_of_solids_files_lose_nothing_outside(tmp_path):
-    (tmp_path / "outside").mkdir()
-    mine = tmp_path / "outside" / "mine"
-    mine.write_text("mine")
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    solids = SceneSolids(np.zeros((1, 3, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros(1, bool))
-    path = stored(solids, folder)
-    path.unlink()
-    path.symlink_to(mine.with_name("nothing"))
-    for number in range(12):
-        (folder / f"solids_{number}.npz").symlink_to(mine)
-    assert stored(solids, folder) == path
-    assert list(folder.iterdir()) == [path]
-    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
-    assert mine.read_text() == "mine"
