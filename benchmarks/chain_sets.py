@@ -19,7 +19,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.motion import built_in_vectors
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh
-from primdiffusion.human import Human, people_of
+from primdiffusion.human import Human, decode_humans
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import (
@@ -187,7 +187,7 @@ def generated(model: DiffusionModel, count: int) -> Iterator[tuple[Tensor, Human
     for first in range(0, count, TOGETHER):
         seeds = list(range(first, min(first + TOGETHER, count)))
         *_, last = sample(model, seeds)
-        yield from zip(last.x0.split(1), people_of(model, last.x0, seeds), strict=True)
+        yield from zip(last.x0.split(1), decode_humans(model, last.x0, seeds), strict=True)
 
 
 def rest_of(model: DiffusionModel, samples: Sequence[Tensor]) -> Tensor | None:

@@ -18,7 +18,7 @@ from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.person import make_person
 from primdiffusion.people.stored_people import read_payloads
-from primdiffusion.people.wardrobe import words_of
+from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
@@ -60,7 +60,7 @@ def like(model: DiffusionModel, people: Sequence[Mapping[str, object]]) -> Itera
     """Ours, each with the attributes of one of these people: distances do not depend on which outfits seeds drew."""
     known = model.vocabulary.categories
     for seed, attributes in enumerate(people):
-        words = words_of(attributes)
+        words = attribute_labels(attributes)
         yield from asked(model, [seed], {key: word for key, word in words.items() if word in known.get(key, ())})
 
 

@@ -19,7 +19,7 @@ from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import SAMPLERS
-from primdiffusion.human import Human, people_of
+from primdiffusion.human import Human, decode_humans
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import blends, mixed, weighted_error
@@ -80,4 +80,4 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
     with torch.inference_mode():
         *_, last = SAMPLERS["ddim"](denoise, schedule, torch.cat(starts), chain, seeded(0))
         x0 = prior.join(last.x0, prior.rest_variance.sqrt() * decoded_rest(denoiser, last.x0)).clone()
-        return [human.validate() for human in people_of(model, x0, seeds)]
+        return [human.validate() for human in decode_humans(model, x0, seeds)]

@@ -33,7 +33,7 @@ from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.stored_people import PersonFolder, find_payloads, read_outline, read_payloads
@@ -248,7 +248,7 @@ def make_grids(paths: Sequence[Path], folder: Path) -> None:
         voxels = person.voxels.movedim(-1, -4).float() / 255
         rgb, density = decode_srgb(voxels[:, :, :3]), voxels[0, :, 3] * person.full_density
         grids = voxelise(rest_frames(person.betas.numpy()), rgb, density, person.full_density)
-        with written_whole(folder / path.name) as unfinished, unfinished.open("wb") as file:
+        with atomic_path(folder / path.name) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(file, grids=grids.numpy())
         if number % 50 == 0:
             print("grids", number, "of", len(missing), flush=True)
@@ -283,7 +283,7 @@ def prepared(
         for part, one in records.items()
         for field in dataclasses.fields(one)
     }
-    with written_whole(stored) as unfinished:
+    with atomic_path(stored) as unfinished:
         unfinished.write_bytes(save(contents))
     return codec, people, prior
 

@@ -50,7 +50,7 @@ PROTOCOL = 1
 HEARTBEAT_S = 0.5
 LONGEST_LINE = LARGEST_BYTES + 2
 """Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
-GRACE_S = 3.0
+SHUTDOWN_TIMEOUT_S = 3.0
 """Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""
 
 JsonId = str | int | float | None
@@ -169,7 +169,7 @@ class Server:
     def run(self) -> None:
         """Serve until shutdown or until input or output is closed. Call from the main thread."""
         threading.Thread(target=self._read, name="reader", daemon=True).start()
-        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
+        threading.Thread(target=self._send_heartbeats, name="heartbeat", daemon=True).start()
         session = self._warm_up()
         while (running := self._queue.get()) is not None:
             self._run_request(session, running)
@@ -234,18 +234,18 @@ class Server:
         self._queue.put(running)
 
     def _end(self) -> None:
-        """Exit at once without a running request, otherwise after GRACE_S for it to clean up."""
+        """Exit at once without a running request, otherwise after SHUTDOWN_TIMEOUT_S for it to clean up."""
         self._ended.set()
         with self._lock:
             if self._running is None:
                 _exit(0)
             self._running.cancelled.set()
         self._queue.put(None)
-        threading.Timer(GRACE_S, _exit, [0]).start()
+        threading.Timer(SHUTDOWN_TIMEOUT_S, _exit, [0]).start()
 
     # heartbeat thread
 
-    def _beat(self) -> None:
+    def _send_heartbeats(self) -> None:
         while not self._ended.wait(HEARTBEAT_S):
             try:
                 self._wire.notify("heartbeat")

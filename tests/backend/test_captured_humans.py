@@ -12,7 +12,7 @@ from primdiffusion import cli
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import set_up_capture, set_up_together
-from primdiffusion.captured_humans import VolumetricPerson, find_subjects, read_subject, renderer_of
+from primdiffusion.captured_humans import VolumetricPerson, find_subjects, read_subject, renderer_name
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.human import Human, place
@@ -233,8 +233,8 @@ def test_humans_are_found_by_their_names(tmp_path):
     save_person(tmp_path / "f" / "person.glb")
     assert list(find_subjects(tmp_path)) == ["a", "b", "c", "f"]
     assert find_subjects(tmp_path / "a.human") == {"a": tmp_path / "a.human"}
-    assert renderer_of([tmp_path / "f" / "person.glb"]) == "rasteriser"
-    assert renderer_of([tmp_path / "a.human"]) == "marcher"
+    assert renderer_name([tmp_path / "f" / "person.glb"]) == "rasteriser"
+    assert renderer_name([tmp_path / "a.human"]) == "marcher"
     for one in ("d e.human", "f/person.glb"):
         with refused(ValueError, one):
             find_subjects(tmp_path / one)

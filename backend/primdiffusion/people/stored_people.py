@@ -20,7 +20,7 @@ from primdiffusion.files.arrays import LARGEST_NUMBER, array_shape, read_arrays
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.geometry.image import decode_srgb
-from primdiffusion.people.wardrobe import words_of
+from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.primitives import K, Payload, S
 
 _ABOUT = ("betas", "attributes", "full_density")
@@ -97,7 +97,7 @@ class Outline:
         """`PersonVariants.attributes`."""
         measures = measure(default_body().shape(self.betas))
         body = {"height": measures.height, "weight": measures.weight}
-        return tuple({**words_of(colouring), **body} for colouring in self.colourings())
+        return tuple({**attribute_labels(colouring), **body} for colouring in self.colourings())
 
 
 def _damage_named(path: Path) -> contextlib.AbstractContextManager[None]:

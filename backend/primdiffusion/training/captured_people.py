@@ -87,7 +87,7 @@ def looks_of(
     if settings.refine_steps:
         frames = range(subject.frames)
         pictures = [conditioning_views(captures, name, frame, None, settings.refine_size) for frame in frames]
-    for frame in frames_of_looks(subject.frames, settings.looks):
+    for frame in choose_frames(subject.frames, settings.looks):
         cameras = spread_cameras(subject, frame, settings.views, model.body)
         payload = model.encode(conditioning_views(captures, name, frame, cameras), given).validate()
         if pictures:
@@ -97,7 +97,7 @@ def looks_of(
     return payloads, betas
 
 
-def frames_of_looks(frames: int, looks: int) -> list[int]:
+def choose_frames(frames: int, looks: int) -> list[int]:
     """Return `looks` evenly spaced frames from the first on, or all if there are fewer."""
     count = min(frames, looks)
     return [look * frames // count for look in range(count)]

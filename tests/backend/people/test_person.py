@@ -14,7 +14,7 @@ from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
 from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, open_assets, parse_mhclo
 from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.fitting import shown_faces, skirt_faces, under_hat, under_hem
+from primdiffusion.people.fitting import shown_faces, skin_under_hem, skirt_faces, under_hat
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
 from primdiffusion.people.person import make_person, recolour
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body
@@ -100,8 +100,8 @@ def test_hat_covers_hair_above_its_tilted_brim():
 
 def test_socks_end_under_trousers_but_not_under_skirts():
     sock, face = np.array([[0.0, 0.1, 0], [0, 0.2, 0]]), np.array([[0, 0, 0], [1, 1, 1]])
-    assert under_hem(np.array([[0.0, 0.12, 0], [0, 1, 0]]), sock, face).tolist() == [False, True]
-    assert under_hem(np.array([[0.0, 0.6, 0], [0, 1, 0]]), sock, face).tolist() == [False, False]
+    assert skin_under_hem(np.array([[0.0, 0.12, 0], [0, 1, 0]]), sock, face).tolist() == [False, True]
+    assert skin_under_hem(np.array([[0.0, 0.6, 0], [0, 1, 0]]), sock, face).tolist() == [False, False]
 
 
 def test_femininity_separates_the_bodies_the_shape_space_was_made_from(base):

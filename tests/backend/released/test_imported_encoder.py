@@ -14,7 +14,7 @@ from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.commands.import_released import read_released
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.config import RELEASED
-from primdiffusion.encoder.model import load_encoder, look_up
+from primdiffusion.encoder.model import load_encoder, unproject_views
 from primdiffusion.files import tensor_file
 from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.geometry.camera import look_at
@@ -138,7 +138,7 @@ def test_reconstruct_makes_the_human_that_the_twin_makes_of_the_texture(folder, 
     model = load_encoder(encoder_file)
     person = captured_person(folder / "captures", body=model.body)
     assert person.warnings == ()
-    texture = look_up(model.config, person.views, person.betas, model.body_setup).rgb[0]
+    texture = unproject_views(model.config, person.views, person.betas, model.body_setup).rgb[0]
     assert texture.max() > 100
     slabs = StageOneTwin(stage)(texture, torch.zeros(72))
     torch.testing.assert_close(human.payload.delta_scale.double(), 1 / slabs.delta_s, rtol=1e-4, atol=0)

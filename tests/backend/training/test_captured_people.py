@@ -14,7 +14,7 @@ from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.formats.requests import EncodeSettings
 from primdiffusion.people.stored_people import PersonFolder, read_payloads
 from primdiffusion.primitives.primitives import K, S
-from primdiffusion.training.captured_people import encode_people, frames_of_looks, read_cards
+from primdiffusion.training.captured_people import choose_frames, encode_people, read_cards
 from support.errors import refused
 from support.tiny import save_tiny_encoder, tiny_encoder
 
@@ -64,8 +64,8 @@ def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_p
 
 
 def test_looks_are_frames_from_the_first_to_the_last(root, tmp_path):
-    assert frames_of_looks(20, 4) == [0, 5, 10, 15]
-    assert frames_of_looks(2, 9) == [0, 1]
+    assert choose_frames(20, 4) == [0, 5, 10, 15]
+    assert choose_frames(2, 9) == [0, 1]
     outcomes(root, tmp_path, EncodeSettings(looks=2))
     voxels = read_payloads(tmp_path / f"{FIRST}.npz").voxels
     assert len(voxels) == 2
