@@ -19,7 +19,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu.adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
 from primdiffusion.render.cpu.compiled import on_all_threads
-from primdiffusion.render.cpu.forward import ImageRows, SaturationPoints, march_tiles
+from primdiffusion.render.cpu.forward import Ends, ImageRows, march_tiles
 from primdiffusion.render.cpu.packing import PackedScene, heaviest_first, pack
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
@@ -78,7 +78,7 @@ def count_samples(
 
 def draw_with_ends(
     primitives: Primitives, camera: Camera, settings: MarchSettings
-) -> tuple[Rendering, _View, PackedScene, SaturationPoints]:
+) -> tuple[Rendering, _View, PackedScene, Ends]:
     """Render without gradients; also return the scene with empty cells and the ends of the rays, for derivatives."""
     view = _view(primitives.map(lambda tensor: tensor.detach()), camera, settings, None)
     inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
@@ -187,15 +187,15 @@ def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> PackedScene:
     return scene
 
 
-def _ends(rays: int) -> SaturationPoints:
+def _ends(rays: int) -> Ends:
     """Allocate for a number of rays."""
-    return SaturationPoints(
+    return Ends(
         np.empty(rays, np.int64), np.empty(rays, np.int32), np.empty(rays, np.float32), np.empty((rays, 3), np.float32)
     )
 
 
 def _draw(
-    view: _View, scene: PackedScene, ends: SaturationPoints, counts: Int64[ndarray, "tiles 2"] | None = None
+    view: _View, scene: PackedScene, ends: Ends, counts: Int64[ndarray, "tiles 2"] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return rgb, alpha, depth and first hit, one row per pixel. Fills `ends` and `counts` unless they are empty."""
     rays = view.width * view.height
@@ -241,13 +241,7 @@ class _March(torch.autograd.Function):
 
 
 def _upstream(
-    ends: SaturationPoints,
-    spacing: float,
-    alpha: Tensor,
-    depth: Tensor,
-    g_rgb: Tensor,
-    g_alpha: Tensor,
-    g_depth: Tensor,
+    ends: Ends, spacing: float, alpha: Tensor, depth: Tensor, g_rgb: Tensor, g_alpha: Tensor, g_depth: Tensor
 ) -> Upstream:
     """Gradients of each ray's samples (SPEC 4)."""
     distance, origin, constant = np.empty((3, len(alpha)), np.float32)
