@@ -19,7 +19,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.motion import built_in_vectors
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh
-from primdiffusion.human import Human, people_of
+from primdiffusion.human import Human, decode_humans
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import (
@@ -34,7 +34,7 @@ from primdiffusion.people.payloads import (
     voxels_from_payload,
 )
 from primdiffusion.people.person import Person, make_person, recolour
-from primdiffusion.people.stored_people import PersonVariants, read_person
+from primdiffusion.people.stored_people import PersonVariants, read_payloads
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
@@ -187,7 +187,7 @@ def generated(model: DiffusionModel, count: int) -> Iterator[tuple[Tensor, Human
     for first in range(0, count, TOGETHER):
         seeds = list(range(first, min(first + TOGETHER, count)))
         *_, last = sample(model, seeds)
-        yield from zip(last.x0.split(1), people_of(model, last.x0, seeds), strict=True)
+        yield from zip(last.x0.split(1), decode_humans(model, last.x0, seeds), strict=True)
 
 
 def rest_of(model: DiffusionModel, samples: Sequence[Tensor]) -> Tensor | None:
@@ -214,4 +214,4 @@ def recoloured(person: Person, number: int, count: int) -> list[Person]:
 
 def stored_fit(folder: Path, number: int) -> PersonVariants:
     """A held-out person's fitted payload from its file."""
-    return read_person(folder / f"person_{FIRST_SEED + number:06d}.npz")
+    return read_payloads(folder / f"person_{FIRST_SEED + number:06d}.npz")

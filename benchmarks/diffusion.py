@@ -46,7 +46,7 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import place
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.payloads import rest_frames
-from primdiffusion.people.stored_people import find_people, read_person
+from primdiffusion.people.stored_people import find_payloads, read_payloads
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
 from primdiffusion.training.latents import split_people
@@ -139,7 +139,7 @@ def main() -> None:
         )  # fmt: skip
         rows = comparisons(reference, model, assets, arguments)
     if arguments.people is not None:
-        train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
+        train, held = split_people(find_payloads(arguments.people), arguments.holdout, arguments.seed)
         figures |= photograph_figures(model, held, arguments)
         if not arguments.quick and model.card.get("geometries") == len(train):  # the people that it was trained on
             figures["nearest_neighbour_ratio_latent"] = latent_ratio(model, train, held)
@@ -195,12 +195,12 @@ def comparisons(
             "old_codec": lambda: from_meshes(assets, seeds_of(count, OTHER_SEED), old),
         }
     if arguments.people is not None:
-        some = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)[0][:count]
+        some = split_people(find_payloads(arguments.people), arguments.holdout, arguments.seed)[0][:count]
         sets |= {
             "payload": lambda: stored(some, 1),
             "voxel_people": lambda: stored_voxels(some, colourings=1),
         }
-        if model.full_density == read_person(some[0]).full_density:
+        if model.full_density == read_payloads(some[0]).full_density:
             sets |= {"codec": lambda: decoded(model, some, 1)}
         if arguments.voxel is not None:
             baseline = load_voxel_model(arguments.voxel)
@@ -247,7 +247,7 @@ def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> 
         return model.encode(payload)  # pyright: ignore[reportArgumentType]
 
     made = [encode(human.payload).flatten() for human in generated(model, seeds_of(len(held)))]
-    real = [encode(read_person(path).payload(0)).flatten() for path in held]
+    real = [encode(read_payloads(path).payload(0)).flatten() for path in held]
     found = nearest_stored(torch.stack([*made, *real]), train, encode, progress("latents"))
     return float(found.distance[: len(made)].median() / found.distance[len(made) :].median())
 
@@ -314,8 +314,8 @@ def pictures() -> None:
     parser.add_argument("--neighbours", type=Path, required=True, help="PNG to write")
     arguments = parser.parse_args()
     model = load_checkpoint(arguments.checkpoint)
-    train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
-    train += [] if arguments.more is None else find_people(arguments.more)
+    train, held = split_people(find_payloads(arguments.people), arguments.holdout, arguments.seed)
+    train += [] if arguments.more is None else find_payloads(arguments.more)
     neighbours(model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
     print(arguments.neighbours, "among", len(train))
 
@@ -327,7 +327,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
         return model.encode(payload)
 
     people = list(generated(model, seeds_of(count)))
-    references = [read_person(path).payload(0) for path in held[:: max(len(held) // 32, 1)]]
+    references = [read_payloads(path).payload(0) for path in held[:: max(len(held) // 32, 1)]]
     queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
     found = nearest_stored(queries, train, encode, progress("latents"))
     new = found.distance[count:].median()
@@ -340,7 +340,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
 
 
 def stored_one(path: Path, colouring: int) -> Primitives:
-    person = read_person(path)
+    person = read_payloads(path)
     return Primitives.place(rest_frames(person.betas.numpy()), person.payload(colouring))
 
 

@@ -17,8 +17,8 @@ from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.person import make_person
-from primdiffusion.people.stored_people import read_person
-from primdiffusion.people.wardrobe import words_of
+from primdiffusion.people.stored_people import read_payloads
+from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
@@ -60,7 +60,7 @@ def like(model: DiffusionModel, people: Sequence[Mapping[str, object]]) -> Itera
     """Ours, each with the attributes of one of these people: distances do not depend on which outfits seeds drew."""
     known = model.vocabulary.categories
     for seed, attributes in enumerate(people):
-        words = words_of(attributes)
+        words = attribute_labels(attributes)
         yield from asked(model, [seed], {key: word for key, word in words.items() if word in known.get(key, ())})
 
 
@@ -88,7 +88,7 @@ def voxels(model: VoxelModel, seeds: Sequence[int]) -> Iterator[Primitives]:
 def decoded(model: DiffusionModel, paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:
     """Stored humans after the codec alone: the best that a perfect denoiser could generate."""
     for path in paths:
-        person = read_person(path)
+        person = read_payloads(path)
         frames = rest_frames(person.betas.numpy())
         for number in range(len(person.voxels))[:colourings]:
             yield Primitives.place(frames, plain(model.decode(model.encode(person.payload(number)))))
@@ -102,7 +102,7 @@ def plain(payload: Payload) -> Payload:
 def stored(paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:
     """Stored humans, in all colourings or the first ones."""
     for path in paths:
-        person = read_person(path)
+        person = read_payloads(path)
         frames = rest_frames(person.betas.numpy())
         for number in range(len(person.voxels))[:colourings]:
             yield Primitives.place(frames, person.payload(number))
@@ -113,7 +113,7 @@ def stored_voxels(
 ) -> Iterator[Primitives]:
     """Stored humans as grids of 64^3 voxels, the limit of that representation; with a model, after its codec."""
     for path in paths:
-        person = read_person(path)
+        person = read_payloads(path)
         frames = rest_frames(person.betas.numpy())
         for number in range(len(person.voxels))[:colourings]:
             grid = voxelise_payload(frames, person.payload(number), person.full_density)

@@ -45,7 +45,7 @@ from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.drawing import Scene, ViewSettings, draw
-from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
+from primdiffusion.encoder.model import EncoderModel, load_encoder, unproject_views
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import (
@@ -328,7 +328,7 @@ def reconstruct_seconds(model: EncoderModel, captures: Captures, repeats: int) -
         return model.encode(person.views, person.betas)
 
     def unproject() -> object:
-        return look_up(model.config, person.views, person.betas)
+        return unproject_views(model.config, person.views, person.betas)
 
     whole()
     figures = {}

@@ -48,7 +48,7 @@ ATTACKS = (
     "tests/contract/test_setup_environment.py::test_pip_gets_no_line_that_was_not_read",
     "tests/backend/capture/test_farm.py::test_a_subject_that_would_be_an_option_or_a_path_is_handed_to_no_renderer",
     "tests/backend/capture/test_render.py::test_no_worker_writes_through_a_link_in_the_folder_of_a_human",
-    "tests/backend/files/test_regular_files_removing.py",
+    "tests/backend/files/test_regular_files.py",
     "tests/backend/files/test_whole_files.py::test_no_file_is_written_through_a_link_out_of_the_folder",
     "tests/backend/released/test_inventory.py::"
     "test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file",

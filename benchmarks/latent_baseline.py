@@ -19,7 +19,7 @@ from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import SAMPLERS
-from primdiffusion.human import Human, people_of
+from primdiffusion.human import Human, decode_humans
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import blends, mixed, weighted_error
@@ -51,8 +51,7 @@ class DecoderObjective:
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted error of a random batch."""
-        clean = torch.zeros(self.config.batch, dtype=torch.int64)
-        weights, indices = blends(self.people, clean, self.config.blend, generator)
+        weights, indices = blends(self.people, self.config.batch, self.config.blend, generator)
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), generator=generator) < 0.5
         z[flip] = self.codec.mirror(z[flip])
@@ -81,4 +80,4 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
     with torch.inference_mode():
         *_, last = SAMPLERS["ddim"](denoise, schedule, torch.cat(starts), chain, seeded(0))
         x0 = prior.join(last.x0, prior.rest_variance.sqrt() * decoded_rest(denoiser, last.x0)).clone()
-        return [human.validate() for human in people_of(model, x0, seeds)]
+        return [human.validate() for human in decode_humans(model, x0, seeds)]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from primdiffusion.people.stored_people import read_person
+from primdiffusion.people.stored_people import read_payloads
 from primdiffusion.primitives.primitives import Payload
 from torch import Tensor
 
@@ -51,5 +51,5 @@ def nearest_stored(
 
 def encoded_person(path: Path, encode: Encode) -> Float[Tensor, "n d"]:
     """Flattened latents of all colourings in a file."""
-    person = read_person(path)
+    person = read_payloads(path)
     return torch.stack([encode(person.payload(one)).flatten().cpu() for one in range(len(person.voxels))])

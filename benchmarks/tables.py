@@ -33,7 +33,7 @@ from primdiffusion.evaluation.tables import (
     reference_cells,
     table,
 )
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.render.march import MarchSettings
@@ -177,7 +177,7 @@ def judged(
         parts.append({"features": features, "own": one.correct, "depth": one.depth})
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(path) as unfinished:
+            with atomic_path(path) as unfinished:
                 unfinished.write_text(json.dumps(parts[-1]), encoding="utf-8")
         print(name, first + len(some), "of", len(seeds), flush=True)
     features = {key: torch.cat([torch.tensor(part["features"][key]) for part in parts]) for key in parts[0]["features"]}

@@ -33,10 +33,10 @@ from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.people.payloads import rest_frames
-from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
+from primdiffusion.people.stored_people import PersonFolder, find_payloads, read_outline, read_payloads
 from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
@@ -218,7 +218,7 @@ def voxels() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    paths = find_people(arguments.people)
+    paths = find_payloads(arguments.people)
     make_grids(paths, arguments.out / "grids")
     if arguments.grids_only:
         return
@@ -229,7 +229,7 @@ def voxels() -> None:
     denoiser, shapes = voxel_denoiser(prior, codec), fit_shapes(people, prior)
     settings = dataclasses.replace(LOCAL, batch=arguments.batch)
     objective = RestObjective(denoiser, people, codec, vocabulary, settings)  # pyright: ignore[reportArgumentType]
-    full_density = read_person(train_paths[0]).full_density
+    full_density = read_payloads(train_paths[0]).full_density
 
     def save(about: dict[str, object]) -> None:
         model = VoxelModel(denoiser, codec, shapes, full_density, {**about, "schedule": SCHEDULE})
@@ -244,11 +244,11 @@ def make_grids(paths: Sequence[Path], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     missing = [path for path in paths if not (folder / path.name).is_file()]
     for number, path in enumerate(missing):
-        person = read_person(path)
+        person = read_payloads(path)
         voxels = person.voxels.movedim(-1, -4).float() / 255
         rgb, density = decode_srgb(voxels[:, :, :3]), voxels[0, :, 3] * person.full_density
         grids = voxelise(rest_frames(person.betas.numpy()), rgb, density, person.full_density)
-        with written_whole(folder / path.name) as unfinished, unfinished.open("wb") as file:
+        with atomic_path(folder / path.name) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(file, grids=grids.numpy())
         if number % 50 == 0:
             print("grids", number, "of", len(missing), flush=True)
@@ -283,7 +283,7 @@ def prepared(
         for part, one in records.items()
         for field in dataclasses.fields(one)
     }
-    with written_whole(stored) as unfinished:
+    with atomic_path(stored) as unfinished:
         unfinished.write_bytes(save(contents))
     return codec, people, prior
 
@@ -294,7 +294,7 @@ def encoded(
     """Everybody's latents and what is said of them, as of primitives."""
     latents, conditions, betas = [], [], []
     for path, one in zip(paths, grids, strict=True):
-        person = read_person(path)
+        person = read_payloads(path)
         latents.append(codec.encode(one).half())
         conditions += [vocabulary.encode(attributes) for attributes in person.attributes]
         betas.append(person.betas)

@@ -27,7 +27,7 @@ from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Frames, Payload, Primitives
@@ -393,7 +393,7 @@ def save_voxel_model(path: Path, model: VoxelModel) -> None:
     tensors |= {f"codec.{field.name}": getattr(model.codec, field.name) for field in dataclasses.fields(VoxelCodec)}
     tensors |= {f"shapes.{field.name}": getattr(model.shapes, field.name) for field in dataclasses.fields(ShapePrior)}
     about = {"full_density": model.full_density, "card": model.card}
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         contents = {name: value.detach().contiguous() for name, value in tensors.items()}
         unfinished.write_bytes(save(contents, metadata={"about": json.dumps(about)}))
 

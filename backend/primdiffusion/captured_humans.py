@@ -141,7 +141,7 @@ def is_generated(path: Path) -> bool:
     return path.name.endswith(ENDINGS)
 
 
-def renderer_of(paths: Sequence[Path]) -> str:
+def renderer_name(paths: Sequence[Path]) -> str:
     """What draws the humans of these files, as dataset.json names it."""
     generated = {is_generated(path) for path in paths}
     return " and ".join(name for kind, name in ((False, "rasteriser"), (True, "marcher")) if kind in generated)

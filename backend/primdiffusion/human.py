@@ -49,7 +49,11 @@ FRAMING_MARGIN = 1.04
 
 @dataclasses.dataclass(frozen=True)
 class Human(TensorRecord):
-    """One human, independent of pose: the payload of the primitives and the shape of the body they are attached to."""
+    """One human, independent of pose: the payload of the primitives and the shape of the body they are attached to.
+
+    >>> human.validate().betas.shape
+    torch.Size([10])
+    """
 
     payload: Payload
     """Unbatched."""
@@ -130,7 +134,7 @@ def generate_batch(
         conditioning["guidance"] = guidance
     ending = {} if end == CLEAN else {"end": end}
     shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
-    people = people_of(model, final, seeds, attributes)
+    people = decode_humans(model, final, seeds, attributes)
     missed = ({"unfollowed": names} if names else {} for names in unfollowed(model, final, attributes))
     return [
         dataclasses.replace(human, provenance={"seed": seed, **shared, **names}).validate()
@@ -139,7 +143,7 @@ def generate_batch(
 
 
 @on_fixed_threads
-def people_of(
+def decode_humans(
     model: DiffusionModel,
     x0: Float[Tensor, "b c h w"],
     seeds: Sequence[int],

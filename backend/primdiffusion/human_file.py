@@ -24,7 +24,7 @@ import torch
 from primdiffusion.body.model import LARGEST_BETA, BodyModel
 from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError, as_file_error
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.formats.human_layout import (
     COMPACT_SCALES,
     COMPACT_VERSION,
@@ -86,7 +86,7 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
         rgb, density, scales = to_eight_bits(payload.rgb.cpu().numpy(), payload.density.cpu().numpy())
         tensors |= {"rgb": torch.from_numpy(rgb), "density": torch.from_numpy(density)}
         metadata |= {"format_version": str(COMPACT_VERSION), COMPACT_SCALES: scales}
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         unfinished.write_bytes(tensor_file.save(tensors, metadata))
 
 
@@ -203,5 +203,5 @@ def save_body(path: str | Path, body: BodyModel, anchors: Anchors) -> None:
         "rest_half_extent": anchors.rest_half_extent,
     }
     plain = {name: value.detach().cpu().contiguous() for name, value in arrays.items()}
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         unfinished.write_bytes(tensor_file.save(plain, {"format": BODY_FORMAT, "format_version": "1"}))

@@ -13,6 +13,7 @@ closes, because its parent has exited. File descriptor 1 is redirected to stderr
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import math
@@ -24,7 +25,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
-from primdiffusion.commands import FUNCTIONS, function_of
+from primdiffusion.commands import FUNCTIONS, function_of, open_session
 from primdiffusion.files.json_files import LARGEST_BYTES, parse_message
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
@@ -49,7 +50,7 @@ PROTOCOL = 1
 HEARTBEAT_S = 0.5
 LONGEST_LINE = LARGEST_BYTES + 2
 """Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
-GRACE_S = 3.0
+SHUTDOWN_TIMEOUT_S = 3.0
 """Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""
 
 JsonId = str | int | float | None
@@ -168,7 +169,7 @@ class Server:
     def run(self) -> None:
         """Serve until shutdown or until input or output is closed. Call from the main thread."""
         threading.Thread(target=self._read, name="reader", daemon=True).start()
-        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
+        threading.Thread(target=self._send_heartbeats, name="heartbeat", daemon=True).start()
         session = self._warm_up()
         while (running := self._queue.get()) is not None:
             self._run_request(session, running)
@@ -233,18 +234,18 @@ class Server:
         self._queue.put(running)
 
     def _end(self) -> None:
-        """Exit at once without a running request, otherwise after GRACE_S for it to clean up."""
+        """Exit at once without a running request, otherwise after SHUTDOWN_TIMEOUT_S for it to clean up."""
         self._ended.set()
         with self._lock:
             if self._running is None:
                 _exit(0)
             self._running.cancelled.set()
         self._queue.put(None)
-        threading.Timer(GRACE_S, _exit, [0]).start()
+        threading.Timer(SHUTDOWN_TIMEOUT_S, _exit, [0]).start()
 
     # heartbeat thread
 
-    def _beat(self) -> None:
+    def _send_heartbeats(self) -> None:
         while not self._ended.wait(HEARTBEAT_S):
             try:
                 self._wire.notify("heartbeat")
@@ -256,10 +257,8 @@ class Server:
     def _warm_up(self) -> Session | RpcError:
         """Import torch and what needs it; an import error becomes the error of every later request."""
         try:
-            # after `hello` can be answered; the other two are loaded before the first request
-            from primdiffusion.commands import output, render, session  # noqa: F401
-
-            started = session.Session()
+            started = open_session()
+            function_of("render")  # loads what most requests need before the first one
         except Exception as e:
             error = _as_rpc_error(e)
             self._state = Ready(problem=str(error))
@@ -342,16 +341,10 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
     return os.fdopen(source, "rb"), os.fdopen(sink, "wb")
 
 
-@dataclasses.dataclass(frozen=True)
-class ServeCommand:
-    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
-
-
 def run(arguments: Sequence[str]) -> None:
-    """`primdiffusion serve`."""
-    from primdiffusion.commands.command_line import parse  # the child does not need tyro
-
-    parse(ServeCommand, arguments, "serve")
+    """`primdiffusion serve`, which has no options."""
+    about = "Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."
+    argparse.ArgumentParser("primdiffusion serve", description=about).parse_args(arguments)
     main()
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..files.picture_files import depth_steps, normal_bytes, write_exr, write_png
 from ..files.regular_files import FileError, as_file_error, check_regular
-from ..files.whole_files import replacing
+from ..files.whole_files import atomic_replace
 from ..formats.capture_layout import picture_path
 from ..scene.convention import points_to_backend
 from .surfaces import PART
@@ -140,7 +140,7 @@ def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
     try:
         sheet.pixels.foreach_set(values.ravel())
         sheet.file_format = "JPEG"
-        with replacing(path) as partial:
+        with atomic_replace(path) as partial:
             sheet.save(filepath=str(partial), quality=JPEG_QUALITY)
             if partial.read_bytes()[-2:] != _JPEG_END:  # on a full disk Blender saves what fits, and says nothing
                 raise OSError(errno.ENOSPC, "there is no room to write", str(path))

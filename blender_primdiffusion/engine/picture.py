@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.regular_files import remove_file
-from ..files.whole_files import replacing
+from ..files.whole_files import atomic_replace
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
@@ -251,7 +251,7 @@ def stored(solids: SceneSolids, folder: Path) -> Path | None:
     for old in list(folder.glob("solids_*.npz")):
         with contextlib.suppress(PermissionError):  # Windows removes no file that the child reads: next time
             remove_file(old, folder)
-    with replacing(path) as partial:
+    with atomic_replace(path) as partial:
         np.savez(partial, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
     return path
 

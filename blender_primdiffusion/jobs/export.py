@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
-from ..files.whole_files import written_whole
+from ..files.whole_files import atomic_path
 from ..formats.answers import GaussiansAnswer, ProxyAnswer
 from ..scene.actions import posed_on
 from ..scene.armature import check_joints
@@ -167,5 +167,5 @@ class ExportGaussiansJob(Job):
 
 def put(source: Path, target: Path) -> None:
     """Copy a finished file to its destination, where it appears whole. Raises OSError."""
-    with written_whole(target) as unfinished:
+    with atomic_path(target) as unfinished:
         shutil.copyfile(source, unfinished)

@@ -17,7 +17,7 @@ from typing import Any
 import bpy
 
 from ..files.regular_files import FileError, read_regular
-from ..files.whole_files import written_whole
+from ..files.whole_files import atomic_path
 from .blend_values import stored_image, stored_record
 
 
@@ -242,7 +242,7 @@ def session_file(armature: bpy.types.Object) -> Path:
         image = stored_image(armature, name, LARGEST_PERSON)
         if image is not None and not (folder / file).is_file():
             folder.mkdir(parents=True, exist_ok=True)
-            with written_whole(folder / file) as unfinished:
+            with atomic_path(folder / file) as unfinished:
                 unfinished.write_bytes(image.packed_file.data)
     return folder / PERSON_FILE
 

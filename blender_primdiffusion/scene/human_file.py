@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..files.arrays import MOST_BODY_VALUES, all_finite, check_shapes, read_arrays
 from ..files.regular_files import FileError, as_file_error, exists_in_its_folder, read_regular
 from ..files.tensor_layout import DTYPES, LENGTH_BYTES, read_layout
-from ..files.whole_files import written_whole
+from ..files.whole_files import atomic_path
 from ..formats.body_layout import body_data, half_extents, stencils
 from ..formats.body_layout import read_layout as read_body_layout
 from ..formats.human_layout import (
@@ -171,7 +171,7 @@ def write_tensors(path: Path, human: HumanTensors) -> None:
         offset += len(raw)
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % LENGTH_BYTES)
-    with written_whole(path) as unfinished, unfinished.open("wb") as file:
+    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
         file.write(len(text).to_bytes(LENGTH_BYTES, "little") + text)
         for name in ordered:
             file.write(human.arrays[name][2])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..files.arrays import all_finite, check_shapes, read_arrays
 from ..files.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
-from ..files.whole_files import written_whole
+from ..files.whole_files import atomic_path
 from .blend_values import stored_record
 from .human import link_part, parts_of, session_folder, state_of, write_error
 from .volume_nodes import volume_material
@@ -164,7 +164,7 @@ def _stored(path: Path) -> str:
 def _copy(source: Path, target: Path) -> None:
     check_inside(target, target.parent.parent)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(target) as unfinished:
+    with atomic_path(target) as unfinished:
         shutil.copyfile(source, unfinished)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..files.arrays import all_finite, check_shapes, read_arrays
 from ..files.regular_files import FileError, as_file_error, portable_name, remove_folder
-from ..files.whole_files import replacing
+from ..files.whole_files import atomic_replace
 from ..formats.joints import JOINT_NAMES
 from .actions import scene_with_only
 from .armature import check_joints, model_origin
@@ -152,7 +152,7 @@ def write_model(
             _EXPORTERS[kind](folder / path.name, frames)
         if not (folder / path.name).is_file():
             raise RuntimeError(f"Blender's exporter wrote no {kind} file: see the console")
-        with replacing(path) as unfinished:
+        with atomic_replace(path) as unfinished:
             shutil.copyfile(folder / path.name, unfinished)
     finally:
         remove_folder(folder, folder.parent)

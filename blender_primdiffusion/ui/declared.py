@@ -14,7 +14,7 @@ from ..formats.schema import Range, Slider, descriptions, field_types, split
 SKIP = {"SKIP_SAVE"}
 _LARGEST = 2**31 - 1
 """Blender's integers are shorter than the backend's."""
-_MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty, bool: bpy.props.BoolProperty}
+_TENSOR_FACTORIES = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty, bool: bpy.props.BoolProperty}
 _NAMES = {"auto": "Automatic", "cpu": "CPU", "gpu": "GPU", "hdri": "HDRI"}
 """Labels of choices that are not their values with a capital."""
 
@@ -22,7 +22,7 @@ _NAMES = {"auto": "Automatic", "cpu": "CPU", "gpu": "GPU", "hdri": "HDRI"}
 def declared(record: type, field: str, **changes: Any) -> Any:
     """A property for a number, a flag, a choice or a file of a record, with `changes` to what is declared."""
     kind, marks = split(field_types(record)[field])
-    maker = _MAKERS.get(kind)
+    maker = _TENSOR_FACTORIES.get(kind)
     settings: dict[str, Any] = {
         "name": field.replace("_", " ").title(),
         "description": descriptions(record).get(field, "").rstrip("."),

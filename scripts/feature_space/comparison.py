@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from primdiffusion.evaluation.images import markdown_table
 from primdiffusion.evaluation.metrics import check_features, frechet_distance, kernel_distance
 from primdiffusion.people.assets import open_assets
-from primdiffusion.people.stored_people import find_people
+from primdiffusion.people.stored_people import find_payloads
 from primdiffusion.training.latents import split_people
 from torch import Tensor
 
@@ -146,7 +146,7 @@ def real_sources(people: Path, assets: Path | None, holdout: float, seed: int) -
 
     Raises ValueError and FileNotFoundError for people or assets that are missing or unreadable.
     """
-    split = split_people(find_people(people), holdout, seed)
+    split = split_people(find_payloads(people), holdout, seed)
     if assets is None:
         train, held = (payload_sources(paths) for paths in split)
         return train, held

@@ -17,12 +17,12 @@ from jaxtyping import Int, UInt8
 from primdiffusion.evaluation.images import image_over
 from primdiffusion.files.arrays import read_arrays
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.people.stored_people import read_outline, read_person
+from primdiffusion.people.stored_people import read_outline, read_payloads
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.march import MarchSettings, march
@@ -120,7 +120,7 @@ def payload_sources(paths: Sequence[Path]) -> list[Source]:
     """Payload files, drawn by the marcher."""
 
     def draw(path: Path) -> UInt8[Tensor, "n v h w 4"]:
-        person = read_person(path)
+        person = read_payloads(path)
         frames = rest_frames(person.betas.numpy())
         return torch.stack(
             [portraits(Primitives.place(frames, person.payload(number))) for number in range(len(person.voxels))]
@@ -154,7 +154,7 @@ def open_gallery(sources: Sequence[Source], folder: Path, report: Report = silen
         cached = _cached(path) if path.is_file() else None
         if cached is None:
             cached = source.draw(), source.attributes()
-            with written_whole(path) as unfinished, unfinished.open("wb") as file:
+            with atomic_path(path) as unfinished, unfinished.open("wb") as file:
                 np.savez_compressed(file, pictures=cached[0].numpy(), attributes=json.dumps(cached[1]))
         pictures.append(cached[0])
         attributes += cached[1]

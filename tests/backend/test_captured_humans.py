@@ -11,8 +11,8 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.render import RenderJob, render, set_up_capture, set_up_together
-from primdiffusion.captured_humans import VolumetricPerson, find_subjects, read_subject, renderer_of
+from primdiffusion.capture.render import set_up_capture, set_up_together
+from primdiffusion.captured_humans import VolumetricPerson, find_subjects, read_subject, renderer_name
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.human import Human, place
@@ -171,24 +171,6 @@ def test_pycocotools_reads_a_generated_humans_masks_and_keypoints(whole):
         assert annotation["smpl"]["betas"] == [1.0, -1.0] + [0.0] * 8
 
 
-def test_interrupted_captures_go_on_to_the_same_bytes_and_two_workers_write_them_too(whole, tmp_path):
-    before = everything(whole / "captures")
-    lost = capture_layout.picture_path(whole / "captures" / "ada", "depth", 2, 1)
-    lost.unlink()
-    (whole / "captures" / "ada" / capture_layout.COMPLETE_FILE).unlink()
-    cli.main(words(whole))
-    after = everything(whole / "captures")
-    assert {name for name in before if before[name] != after[name]} <= {"report.json"}
-    job = RenderJob(
-        {"ada": whole / "people" / "ada.human"}, poses(), tmp_path / "captures",
-        Rig(count=CAMERAS, width=SIZE, height=SIZE), ("img", "mask", "depth"),
-        read=read_subject, renderer="marcher",
-    )  # fmt: skip
-    assert [outcome.status for outcome in render(job, workers=2)] == ["done"]
-    again = everything(tmp_path / "captures" / "ada")
-    assert all(before[f"ada/{name}"] == content for name, content in again.items())
-
-
 def test_a_generated_human_stands_beside_a_mesh(tmp_path):
     save_person(tmp_path / "people" / "box" / "person.glb")
     save(tmp_path / "people" / "ada" / "person.human.safetensors")
@@ -251,8 +233,8 @@ def test_humans_are_found_by_their_names(tmp_path):
     save_person(tmp_path / "f" / "person.glb")
     assert list(find_subjects(tmp_path)) == ["a", "b", "c", "f"]
     assert find_subjects(tmp_path / "a.human") == {"a": tmp_path / "a.human"}
-    assert renderer_of([tmp_path / "f" / "person.glb"]) == "rasteriser"
-    assert renderer_of([tmp_path / "a.human"]) == "marcher"
+    assert renderer_name([tmp_path / "f" / "person.glb"]) == "rasteriser"
+    assert renderer_name([tmp_path / "a.human"]) == "marcher"
     for one in ("d e.human", "f/person.glb"):
         with refused(ValueError, one):
             find_subjects(tmp_path / one)

@@ -8,40 +8,15 @@ import everywhere
 import numpy as np
 import pytest
 from diffusion_people import small_model
-from latent_baseline import decoded_rest, sample_people
 from primdiffusion.capture.coco import KEYPOINTS
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
-from support.errors import refused
-from tables import check_equal
-
-CARD = {"minutes": 3.0, "people": 10, "geometries": 5, "steps": {"local": 7}}
 
 
 @pytest.fixture(scope="module")
 def baseline():
     model = small_model()
     return dataclasses.replace(model, card={**model.card, "baseline": "latents"})
-
-
-def test_everything_of_a_human_follows_from_its_vector(baseline):
-    (human,) = sample_people(baseline, [5], steps=3)
-    prior = baseline.denoiser.prior
-    x0 = baseline.encode(human.payload)[None]
-    coefficients, _ = prior.split(x0)
-    again = prior.join(coefficients, prior.rest_variance.sqrt() * decoded_rest(baseline.denoiser, coefficients))
-    decoded = baseline.decode(again.detach())
-    inside = (human.payload.density > 0) & (human.payload.density < baseline.full_density)
-    assert human.payload.density.std() > 0
-    assert float((decoded.density[0] - human.payload.density)[inside].abs().mean()) < 40
-
-
-def test_unequal_models_are_not_compared():
-    check_equal({"ours": CARD, "latents": {**CARD, "minutes": 3.1}})
-    with refused(ValueError, "trained"):
-        check_equal({"ours": CARD, "latents": {**CARD, "minutes": 4.0}})
-    with refused(ValueError, "trained"):
-        check_equal({"ours": CARD, "latents": {**CARD, "people": 11}})
 
 
 def front() -> View:

@@ -5,20 +5,16 @@ import pytest
 import torch
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.geometry.camera import look_at
-from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
 from support.priors import of_whole_body
 from voxel_baseline import (
-    BOUNDS,
     SIDE,
     VoxelCodec,
     VoxelModel,
     VoxelUNetConfig,
     fit_voxel_codec,
-    load_voxel_model,
     primitives_of,
-    save_voxel_model,
     voxel_denoiser,
     voxelise_payload,
 )
@@ -38,33 +34,6 @@ def boxes(*centres: tuple[float, float, float], half: float = 0.25) -> Frames:
 def plain(count: int, rgb: tuple[float, float, float], density: float) -> Payload:
     colour = torch.tensor(rgb)[None, :, None, None, None].expand(count, 3, 8, 8, 8)
     return Payload(colour.contiguous(), torch.full((count, 8, 8, 8), density), torch.ones(count, 3))
-
-
-def places() -> torch.Tensor:
-    low, high = torch.tensor(BOUNDS)
-    axes = [torch.linspace(float(low[i]), float(high[i]), SIDE) for i in range(3)]
-    z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
-    return torch.stack([x, y, z], dim=-1)
-
-
-def test_a_box_is_where_it_stands_in_its_colour():
-    frames, payload = boxes((0.3, -0.4, 0.05)), plain(1, (0.5, 0.2, 0.1), 60.0)
-    grid = voxelise_payload(frames, payload, FULL).float() / 255
-    far = (places() - frames.position[0]).norm(dim=-1)
-    inside, outside = grid[far < 0.1], grid[far > 0.45]
-    assert torch.allclose(inside[:, 3], torch.tensor(0.6), atol=0.01)
-    assert torch.allclose(inside[:, :3], encode_srgb(torch.tensor([0.5, 0.2, 0.1])), atol=0.01)
-    assert outside[:, 3].max() == 0
-
-
-def test_where_boxes_overlap_densities_add_and_colours_mix_by_density():
-    frames = boxes((0.0, 0.0, 0.05), (0.0, 0.0, 0.05))
-    red, blue = plain(1, (1.0, 0.0, 0.0), 30.0), plain(1, (0.0, 0.0, 1.0), 10.0)
-    both = Payload(*(torch.cat([getattr(one, name) for one in (red, blue)]) for name in vars(red)))
-    grid = voxelise_payload(frames, both, FULL).float() / 255
-    near = grid[(places() - frames.position[0]).norm(dim=-1) < 0.1]
-    assert torch.allclose(near[:, 3], torch.tensor(0.4), atol=0.02)
-    assert torch.allclose(decode_srgb(near[:, :3]), torch.tensor([0.75, 0.0, 0.25]), atol=0.01)
 
 
 def test_a_grid_is_drawn_as_the_boxes_it_was_gathered_from():
@@ -125,23 +94,3 @@ def model(codec) -> VoxelModel:
     denoiser = voxel_denoiser(prior, codec, VoxelUNetConfig())
     shapes = ShapePrior(torch.ones(10, 2), torch.zeros(10), torch.eye(10), torch.full((10,), 3.0))
     return VoxelModel(denoiser, codec, shapes, FULL, {"steps": {"local": 1}})
-
-
-def test_untrained_network_leaves_the_closed_form_and_trained_does_not(model):
-    x = torch.randn(2, *model.denoiser.prior.mean.shape)
-    t = torch.tensor([100, 700])
-    signal, noise = model.denoiser.schedule.levels(t, x)
-    assert torch.allclose(model.denoiser(x, t), model.denoiser.prior.denoise(x, signal, noise), atol=1e-5)
-    before = model.denoiser.local.outer.weight.clone()
-    torch.nn.init.normal_(model.denoiser.local.outer.weight, std=0.1)
-    changed = model.denoiser(x, t)
-    model.denoiser.local.outer.weight.copy_(before)
-    assert not torch.allclose(changed, model.denoiser.prior.denoise(x, signal, noise), atol=1e-2)
-
-
-def test_baseline_is_stored_whole(model, tmp_path):
-    save_voxel_model(tmp_path / "voxel.safetensors", model)
-    again = load_voxel_model(tmp_path / "voxel.safetensors")
-    assert again.card == model.card
-    assert torch.equal(next(again.sample([1], steps=2)).grid, next(model.sample([1], steps=2)).grid)
-    assert torch.equal(again.shapes.scale, model.shapes.scale)

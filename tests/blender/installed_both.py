@@ -1,4 +1,4 @@
-"""Run by test_both_builds in a Blender of its own: install two zips, enable one beside and after the other.
+"""Run by test_registration in a Blender of its own: install two zips, enable one beside and after the other.
 
 python installed_both.py ZIP ZIP
 """

@@ -29,20 +29,3 @@ def test_scenes_name_modules_operators_and_panels_that_exist(addon):
     assert not [name for (name,) in registered if not hasattr(bpy.types, f"PRIMDIFFUSION_OT_{name}")]
     panels = found(r'"(PRIMDIFFUSION_PT_\w+)[/"]')
     assert not [name for (name,) in panels if not hasattr(bpy.types, name)]
-
-
-def test_scenes_open_sections_that_panels_have():
-    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / PACKAGE / "ui").glob("*_panel.py"))
-    there = set(re.findall(r'draw_section\(\w+(?:\.\w+)?, "(\w+)"', sources))
-    there |= {name.lower() for name in re.findall(r', "(\w+)", "\w+", "\w*", draw_\w+\)', sources)}
-    there |= set(re.findall(r'\("(\w+)", "[\w ]+", "\w+", "[\w-]+", _draw_\w+\)', sources))
-    there |= {f"captures_{name.lower()}" for name in re.findall(r'^        \("(\w+)", [(_]', sources, re.MULTILINE)}
-    opened = {name for (name,) in found(r'"PRIMDIFFUSION_PT_\w+/(\w+)"')}
-    assert opened
-    assert opened <= there
-
-
-def test_measured_functions_exist(addon):
-    for module, owner, function in import_module("stalls")._OURS:
-        holder = import_module(f"{PACKAGE}.{module}")
-        assert hasattr(getattr(holder, owner) if owner else holder, function), (module, owner, function)

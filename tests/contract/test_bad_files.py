@@ -31,7 +31,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from primdiffusion.body.model import read_pose
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.capture.people_files import read_person as read_glb
+from primdiffusion.capture.people_files import read_person
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.evaluation.pretrained_networks import read_weights
 from primdiffusion.files import tensor_file
@@ -43,7 +43,7 @@ from primdiffusion.formats.poses.skeleton import REST_JOINTS
 from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
-from primdiffusion.people.stored_people import read_person
+from primdiffusion.people.stored_people import read_payloads
 from primdiffusion.runtime.failures import describe
 from support.tiny import save_tiny_checkpoint, tiny_model
 
@@ -137,9 +137,9 @@ KINDS = {
     "BVH": Kind(bvh, read_motion),
     "AMASS": Kind(amass, read_motion),
     "depth": Kind(depth, read_npy),
-    "payload": Kind(payload, read_person),
+    "payload": Kind(payload, read_payloads),
     "picture": Kind(picture, read_picture),
-    "glb": Kind(glb, read_glb),
+    "glb": Kind(glb, read_person),
 }
 
 

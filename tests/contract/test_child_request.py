@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from conversation import BUSY_STEPS
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.backend.requests import Backend, ChildRequest
-
-PYTHON = Path(sys.executable)
 
 
 def follow(request: ChildRequest, until=lambda request: request.finished, timeout_s: float = 300) -> list[str]:
@@ -60,25 +57,6 @@ def test_a_request_runs_from_a_cold_start_to_its_files(start):
     assert any(eta is not None and eta > 0 for eta in etas)
     assert request.info["device"] in ("cpu", "cuda")
     assert not request.tick(), "a finished request stays as it is"
-
-
-def test_a_cancelled_request_leaves_nothing(backend, start, slow_checkpoint, tmp_path):
-    request = start(BUSY_STEPS, checkpoint=slow_checkpoint)
-    follow(request, lambda request: request.step > 2)
-    request.cancel()
-    assert request.state == "cancelling"
-    assert follow(request) == ["cancelling", "cancelled"]
-    assert request.step < request.total
-    follow(request, lambda _: backend.reap() or not (tmp_path / "out").exists())  # at once, or with a slow child
-    assert request.result is None
-
-
-def test_the_second_of_two_clicks_is_rejected_with_a_sentence_and_the_first_goes_on(start):
-    first, second = start(3), start(3, "second")
-    assert second.state == "failed"
-    assert second.error.kind == "busy"
-    assert str(second.error) == "The backend is at work already. Wait for it, or cancel it first."
-    assert follow(first)[-1] == "done"
 
 
 @pytest.mark.parametrize(

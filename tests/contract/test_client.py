@@ -2,7 +2,6 @@
 
 import json
 import os
-import threading
 import time
 from pathlib import Path
 
@@ -204,14 +203,6 @@ def test_the_bundled_package_goes_before_an_installed_one(fake_child):
     where = wait_for(client, lambda e: isinstance(e, Notification)).params["file"]
     assert "backend" in Path(where).parts
     assert Path(where).is_relative_to(client._environment["PYTHONPATH"])
-
-
-def test_a_client_starts_no_thread(fake_child):
-    before = set(threading.enumerate())
-    client = fake_child("time.sleep(60)")
-    client.request("hello", {})
-    client.poll()
-    assert set(threading.enumerate()) == before
 
 
 def test_kernels_are_kept_in_the_folder_given_for_them_and_byte_code_beside_its_sources(monkeypatch, tmp_path):

@@ -8,7 +8,6 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from primdiffusion.diffusion.model import sample
 from primdiffusion.formats import requests
-from support.errors import refused
 from support.tiny import tiny_model
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -74,18 +73,3 @@ def test_diffusers_loop_draws_the_model_s_own_samples(sampler):
     for t in scheduler.timesteps:
         x, x0 = scheduler.step(model.denoise(x, int(t), condition, GUIDANCE), t, x, generators, return_dict=False)
     assert torch.equal(x0, last.x0)
-
-
-def test_settings_are_saved_and_loaded_as_diffusers_does(tmp_path):
-    PrimDiffusionScheduler("fine_linear", "dense", "dpmpp_2m").save_pretrained(tmp_path)
-    again = PrimDiffusionScheduler.from_pretrained(tmp_path)
-    assert (again.config["schedule"], again.config["chain"], again.sampler) == ("fine_linear", "dense", "dpmpp_2m")
-
-
-def test_wrong_names_and_steps_are_refused():
-    with refused(ValueError, "dpmpp_2m"):
-        PrimDiffusionScheduler(sampler="euler")
-    scheduler = PrimDiffusionScheduler()
-    scheduler.set_timesteps(10)
-    with refused(ValueError, "timestep 3"):
-        scheduler.step(noise(1), 3, noise(1))

@@ -3,12 +3,10 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
-from primdiffusion.editing.regions import parts_of, region_from_weights, region_of
+from primdiffusion.editing.regions import parts_of, region_of
 from primdiffusion.formats.requests import PARTS, SAMPLERS
 from primdiffusion.human_file import load_human, save_human
 from support import tiny
@@ -51,11 +49,6 @@ def parameters(method, people) -> dict:
     }
 
 
-def outside(path, other, region) -> bool:
-    one, two = (load_human(file).payload for file in (path, other))
-    return all(torch.equal(getattr(one, name)[~region], getattr(two, name)[~region]) for name in ("rgb", "density"))
-
-
 @pytest.mark.parametrize("method", EDITS)
 def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, method):
     child.send(1, method, **asked, **parameters(method, people))
@@ -78,36 +71,9 @@ def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, 
     assert not list(Path(asked["out_dir"]).glob(".*"))
 
 
-def test_a_region_may_be_painted(child, people, asked, tmp_path):
-    weights = np.zeros(12196, np.float32)
-    weights[:6000] = 1
-    np.savez(tmp_path / "painted.npz", weights=weights)
-    result = child.ask(3, "inpaint", **asked, weights=str(tmp_path / "painted.npz"))["result"]
-    assert outside(result["person"], people["ann"], region_from_weights(torch.from_numpy(weights)))
-
-
 def test_attributes_tells_what_generate_can_be_asked_for(child, checkpoint):
     known = child.ask(6, "attributes", checkpoint=str(checkpoint))["result"]
     assert known == VOCABULARY.to_json()
-
-
-@pytest.mark.parametrize(
-    ("method", "wrong", "code", "kind", "sentence"),
-    [
-        ("vary", {"person": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
-        ("vary", {"attributes": {"outfit": None}}, INVALID_PARAMS, None, "vary.attributes.outfit"),
-        ("inpaint", {"region": []}, INVALID_PARAMS, None, "inpaint.region"),
-        ("inpaint", {"region": ["clothes", "skin", "hair"]}, DOMAIN_ERROR, "bad_input", "the whole human"),
-        ("inpaint", {"region": [], "weights": "/no.npz"}, DOMAIN_ERROR, "missing_file", "/no.npz"),
-    ],
-)
-def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, sentence):
-    error = child.ask(10, method, **{**asked, **parameters(method, people), **wrong})["error"]
-    assert error["code"] == code
-    assert sentence in error["message"]
-    assert "\n" not in error["message"]
-    assert (error.get("data") or {}).get("kind") == kind
-    assert not Path(asked["out_dir"]).parent.exists()
 
 
 def test_every_part_of_the_body_is_a_region():

@@ -11,18 +11,17 @@ import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import GRID
-from support.errors import refused
 
 pytest.importorskip("igl", reason="libigl comes with the `bake` extra")
 SCRIPT = pathlib.Path(__file__).parents[2] / "scripts/bake_layout"
 sys.path.append(str(SCRIPT))
 
-from charts import PLACES, lay_out  # noqa: E402
-from cutting import cut_along, outline  # noqa: E402
+from charts import lay_out  # noqa: E402
+from cutting import outline  # noqa: E402
 from grid import chart_of_cells, draw  # noqa: E402
-from half_body import FILLED, Sheet, boundary_edges, left_half, mirror_vertices  # noqa: E402
+from half_body import FILLED, boundary_edges, left_half  # noqa: E402
 from rectangle import Disc, flatten  # noqa: E402
-from regions import _split, cut_into_regions  # noqa: E402
+from regions import cut_into_regions  # noqa: E402
 
 
 def sheet_of(columns: int, rows: int, place=lambda s, t: (s, t, 0 * s)) -> tuple[np.ndarray, np.ndarray]:
@@ -81,44 +80,6 @@ def test_flattening_a_bump_ends_in_a_minimum_of_distortion_and_flips_nothing():
         moved = flat.uv.copy()
         moved[generator.choice(inner)] += 0.05 * generator.standard_normal(2)
         assert distortion(flat.disc.points, moved, flat.disc.faces) > reached - 1e-5
-
-
-def test_a_cut_doubles_the_vertices_inside_it_and_the_loop_passes_both_copies():
-    _, faces = sheet_of(4, 4)
-    path = [2, 7, 12]
-    opened, origin = cut_along(faces, path)
-    assert len(origin) == 25 + 2
-    loop = outline(opened)
-    assert sorted(origin[loop]).count(7) == 2
-    assert sorted(origin[loop]).count(12) == 1
-    np.testing.assert_array_equal(origin[opened], faces)
-
-
-def test_splitting_keeps_area_orientation_and_parents():
-    points, faces = sheet_of(5, 5)
-    sheet = Sheet(points, faces, np.arange(len(faces)), np.zeros(len(points), bool))
-    value = points[:, 0] - 0.4 * points[:, 1] - 1.37
-    cut, region, positive = _split(sheet, np.zeros(len(faces), int), value, 0)
-    assert len(cut.faces) > len(faces)
-    assert len(region) == len(positive) == len(cut.parent) == len(cut.faces)
-    assert area(cut.points, cut.faces) == pytest.approx(25)
-    normal = np.cross(*(cut.points[cut.faces[:, k]] - cut.points[cut.faces[:, 0]] for k in (1, 2)))
-    assert normal[:, 2].min() > 0
-    for parent in range(0, len(faces), 7):
-        assert area(cut.points, cut.faces[cut.parent == parent]) == pytest.approx(0.5)
-    middle = cut.points[cut.faces].mean(1)
-    clear = np.abs(middle[:, 0] - 0.4 * middle[:, 1] - 1.37) > 0.3
-    np.testing.assert_array_equal(positive[clear], (middle[:, 0] - 0.4 * middle[:, 1] - 1.37 > 0)[clear])
-
-
-def test_the_charts_tile_the_grid():
-    assert sum(place.width * place.height for place in PLACES.values()) == GRID * GRID // 2
-    assert (chart_of_cells() >= 0).all()
-
-
-def test_a_lopsided_body_is_rejected():
-    with refused(ValueError, "mirror"):
-        mirror_vertices(np.array([[0.1, 0, 0], [-0.2, 0, 0]]))
 
 
 @pytest.mark.slow

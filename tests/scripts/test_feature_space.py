@@ -3,11 +3,10 @@
 import json
 
 import pytest
-import torch
 from diffusion_people import write_people
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.people.stored_people import find_people
+from primdiffusion.people.stored_people import find_payloads
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
@@ -16,9 +15,7 @@ from support.tiny import tiny_model
 
 from scripts.feature_space import __main__ as command
 from scripts.feature_space.comparison import COLUMNS, compare, open_reference_set, real_vs_real
-from scripts.feature_space.network import features_of
 from scripts.feature_space.portraits import (
-    Source,
     made_gallery,
     mesh_sources,
     open_gallery,
@@ -51,23 +48,10 @@ def reference_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def reference(people, reference_folder):
-    train, held = split_people(find_people(people), 0.34, 0)
+    train, held = split_people(find_payloads(people), 0.34, 0)
     sources = [payload_sources(paths) for paths in (train, held)]
     train_reference(*sources, reference_folder)
     return open_reference_set(*sources, reference_folder)
-
-
-def test_portraits_of_stored_people_are_kept_and_not_drawn_again(people, tmp_path):
-    paths = find_people(people)[:2]
-    first = open_gallery(payload_sources(paths), tmp_path)
-    again = open_gallery([Source(path.name, never, never) for path in paths], tmp_path)
-    assert torch.equal(first.pictures, again.pictures)
-    assert first.geometry.tolist() == [0, 0, 1, 1]
-    assert again.attributes[2] == {"outfit": "outfit1"}
-
-
-def never():
-    raise AssertionError("drawn again")
 
 
 def test_portraits_of_meshes_and_of_their_payloads_show_the_same_people(assets, tmp_path):
@@ -97,15 +81,6 @@ def test_people_far_from_all_real_ones_are_far_and_not_precise(reference):
     assert strange.frechet > 10 * real.frechet
     assert strange.kernel > real.kernel
     assert strange.precision == 0
-
-
-def test_reference_set_is_read_back_from_its_folder(people, reference, reference_folder):
-    train, held = split_people(find_people(people), 0.34, 0)
-    again = open_reference_set(
-        *([Source(path.name, never, never) for path in paths] for paths in (train, held)), reference_folder
-    )
-    assert torch.equal(reference.held_features, again.held_features)
-    assert torch.equal(features_of(again.network, again.train.pictures), again.train_features)
 
 
 @pytest.fixture

@@ -156,7 +156,11 @@ J = len(JOINT_NAMES)
 
 @dataclasses.dataclass(frozen=True)
 class BodyPose(TensorRecord):
-    """Joint rotations and translation, independent of the body's shape."""
+    """Joint rotations and translation, independent of the body's shape.
+
+    >>> pd.BodyPose.rest().joint_rotation.shape
+    torch.Size([24, 3, 3])
+    """
 
     joint_rotation: Float[Tensor, "*b J 3 3"]
     """Rotation of each joint relative to its parent; the first rotates the whole body about the pelvis."""

@@ -30,7 +30,7 @@ from primdiffusion.capture.reader import Captures, Subject, joints_from_body, jo
 from primdiffusion.capture.render import JPEG_QUALITY, srgb_bytes
 from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.files.regular_files import FileError
-from primdiffusion.files.whole_files import replacing
+from primdiffusion.files.whole_files import atomic_replace
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import MOST_TOGETHER, View
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -94,7 +94,10 @@ def write_coco(
     """
     if missing := [kind for kind in PASSES if kind not in captures.passes]:
         raise FileError(captures.root, f"has no {' and no '.join(missing)}", f"render with {', '.join(PASSES)}")
-    with replacing(captures.root / ANNOTATIONS_FILE) as path, path.open("w", encoding="utf-8", newline="\n") as file:
+    with (
+        atomic_replace(captures.root / ANNOTATIONS_FILE) as path,
+        path.open("w", encoding="utf-8", newline="\n") as file,
+    ):
         file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
         file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
         file.writelines(_separated(_line(image.record) for image in _images(captures)))
@@ -366,7 +369,7 @@ def write_composed(
     path, view = composed_path(subject, frame, camera), subject.views[camera]
     image = np.zeros((view.height, view.width, 3), np.uint8)
     image[box] = compose(images, shares)
-    with replacing(path, subject.folder.parent) as partial:
+    with atomic_replace(path, subject.folder.parent) as partial:
         Image.fromarray(image).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
 
 

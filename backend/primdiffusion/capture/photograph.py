@@ -30,7 +30,7 @@ SMALLEST_FIGURE = 32
 """Height of a person, pixels, from which a pose can be estimated."""
 SECOND_FIGURE = 0.2
 """Share of the largest component's area from which another is a second person."""
-SPECK = 0.01
+SMALLEST_PART = 0.01
 """Share below which a component is a fault of the mask; those between are parts of the person behind something."""
 MASK_SIDE = 512
 """Largest side of the mask in which components are counted."""
@@ -206,12 +206,12 @@ def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, 
         raise FileError(path, "shows no person: no pixel is half covered", "mark the person white, or name a label")
     areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     largest = areas.max()
-    figures = _figures_beside(labels, 1 + np.flatnonzero(areas >= SECOND_FIGURE * largest), 1 + int(areas.argmax()))
+    figures = _count_figures(labels, 1 + np.flatnonzero(areas >= SECOND_FIGURE * largest), 1 + int(areas.argmax()))
     if figures > 1:
         raise FileError(path, f"shows {figures} separate figures", "leave one person in the mask")
-    person = np.isin(labels, 1 + np.flatnonzero(areas >= SPECK * largest))
+    person = np.isin(labels, 1 + np.flatnonzero(areas >= SMALLEST_PART * largest))
     keep: np.ndarray = np.ones((1, 1), np.uint8)
-    if (areas < SPECK * largest).any():
+    if (areas < SMALLEST_PART * largest).any():
         grown = ndimage.binary_dilation(person, iterations=2)
         keep = np.kron(grown, np.ones((block, block), np.uint8))[: mask.shape[0], : mask.shape[1]].astype(np.uint8)
     rows, columns = np.flatnonzero(person.any(axis=1)), np.flatnonzero(person.any(axis=0))
@@ -223,7 +223,7 @@ def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, 
     return (int(left), int(top), int(right), int(bottom)), keep
 
 
-def _figures_beside(labels: np.ndarray, large: np.ndarray, largest: int) -> int:
+def _count_figures(labels: np.ndarray, large: np.ndarray, largest: int) -> int:
     """1, and the large components that are beside the largest; those above or below it are the same person, behind
     something.
     """

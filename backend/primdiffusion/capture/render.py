@@ -22,7 +22,7 @@ from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import turned
 from primdiffusion.files import picture_files
 from primdiffusion.files.regular_files import check_unlinked
-from primdiffusion.files.whole_files import replacing, write_atomically
+from primdiffusion.files.whole_files import atomic_replace, write_atomically
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere, extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -162,7 +162,7 @@ def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, dr
     for kind in passes:
         path = capture_layout.picture_path(subject, kind, camera, frame)
         if kind == "img":
-            with replacing(path) as partial:
+            with atomic_replace(path) as partial:
                 fromarray(srgb_bytes(drawn.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
             picture_files.write_png(path, np.round(drawn.alpha.clip(0, 1) * 255).astype(np.uint8))

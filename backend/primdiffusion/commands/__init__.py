@@ -4,9 +4,14 @@ It gets a record of `formats.requests` or `options`, checked, and returns its an
 imported when the first request runs, so that the child answers `hello`, and the command line --help, at once.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from primdiffusion.commands.session import Session
 
 FUNCTIONS = {
     "generate": "generate:generate",
@@ -35,3 +40,8 @@ def function_of(name: str) -> Callable[..., Any]:
     """Import the function of a method or subcommand."""
     module, _, function = FUNCTIONS[name].partition(":")
     return getattr(import_module(f"{__name__}.{module}"), function)
+
+
+def open_session() -> Session:
+    """Load torch and choose the device."""
+    return import_module(f"{__name__}.session").Session()

@@ -19,7 +19,7 @@ from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
-from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
+from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_name
 from primdiffusion.files.regular_files import printable
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import MOST_TOGETHER, Arrangement, Rig
@@ -100,7 +100,7 @@ class RenderCaptures:
             released_reference=self.released_reference,
             together=self._groups(people) if self.together > 1 else (),
             read=read_subject,
-            renderer=renderer_of(tuple(people.values())),
+            renderer=renderer_name(tuple(people.values())),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
         outcomes = Counter()

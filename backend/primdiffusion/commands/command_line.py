@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import tyro
 
-from primdiffusion.commands import function_of
+from primdiffusion.commands import function_of, open_session
 from primdiffusion.commands.options import OPTIONS
 from primdiffusion.commands.progress import progress_bar, show
 from primdiffusion.formats.schema import Option, Range, descriptions, field_types, read, split
@@ -23,11 +23,9 @@ _HUGE = 1e18
 def run_record(name: str, arguments: Sequence[str]) -> None:
     """Run a subcommand of `OPTIONS` as the child runs a request, and print its answer; raises its errors."""
     request = parse(OPTIONS[name], arguments, name)
-    from primdiffusion.commands.session import Session  # after --help, which does not need torch
-
     function = function_of(name)
     with progress_bar() as report:
-        answer = function(request, Session(), report)
+        answer = function(request, open_session(), report)
     show(answer)
 
 

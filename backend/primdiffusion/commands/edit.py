@@ -21,7 +21,7 @@ from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import read_weights, region_from_weights, region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
-from primdiffusion.files.whole_files import staged
+from primdiffusion.files.whole_files import atomic_folder
 from primdiffusion.formats.answers import HumanAnswer
 from primdiffusion.formats.requests import (
     EditRequest,
@@ -44,7 +44,7 @@ def edit(request: EditRequest, session: Session, report: ReportProgress) -> Huma
     Raises OSError first of all if the folder cannot be written to; raises as load_human, load_checkpoint and edits.
     """
     began, steps = time.perf_counter(), request.steps
-    with staged(request.out_dir) as folder:
+    with atomic_folder(request.out_dir) as folder:
         report("load", 0, steps, None)
 
         @contextlib.contextmanager

@@ -10,13 +10,13 @@ import torch
 
 from primdiffusion.body.model import read_pose
 from primdiffusion.commands.options import ExportCommand
-from primdiffusion.commands.progress import Pace, ReportProgress
+from primdiffusion.commands.progress import EtaEstimator, ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
 from primdiffusion.export.merged_file import grid_writer, upright_grid, write_grid_npz
 from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb
-from primdiffusion.files.whole_files import staged, written_whole
+from primdiffusion.files.whole_files import atomic_folder, atomic_path
 from primdiffusion.formats.answers import GaussiansAnswer, MergeAnswer, ProxyAnswer
 from primdiffusion.formats.requests import GaussiansRequest, MergeRequest, PosedPerson, ProxyRequest
 from primdiffusion.human import Human, place_on_floor, place_skinned
@@ -30,7 +30,7 @@ def proxy(request: ProxyRequest, session: Session, report: ReportProgress) -> Pr
     Raises OSError first of all if the folder cannot be written to; raises as load_human and mesh_proxy.
     """
     began = time.perf_counter()
-    with staged(request.out_dir) as folder:
+    with atomic_folder(request.out_dir) as folder:
         report("load", 0, 4, None)
         human = _shaped(request.person, request.betas)
         made = mesh_proxy(human, request, lambda stage, done, total: report(stage, done, total + 1, None))
@@ -84,7 +84,7 @@ def export(command: ExportCommand, session: Session, report: ReportProgress) -> 
     if ending == ".ply":
         write_gaussians(command.out, gaussians_of(placed, command.gaussians))
     else:
-        with written_whole(command.out) as path:
+        with atomic_path(command.out) as path:
             write_grid(path, upright_grid(placed, command.voxel))
     return command.out
 
@@ -94,14 +94,14 @@ def merge(request: MergeRequest, session: Session, report: ReportProgress) -> Me
 
     Grids written before an error stay. Raises OSError, and as load_human, place_skinned and merge.
     """
-    began, pace, count = time.perf_counter(), Pace(), len(request.people)
+    began, pace, count = time.perf_counter(), EtaEstimator(), len(request.people)
     request.out_dir.mkdir(parents=True, exist_ok=True)
     load = functools.lru_cache(maxsize=1)(load_human)
     report("merge", 0, count, None)
     files = []
     for index, person in enumerate(request.people):
         file = request.out_dir / f"{index:04d}.npz"
-        with written_whole(file) as path:
+        with atomic_path(file) as path:
             write_grid_npz(path, upright_grid(_placed(load(person.human), person), request.voxel))
         files.append(file)
         report("merge", index + 1, count, pace.left(index + 1, count))

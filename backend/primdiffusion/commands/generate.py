@@ -22,7 +22,7 @@ from primdiffusion.commands.output import (
     write_files,
     write_human,
 )
-from primdiffusion.commands.progress import Pace, ReportProgress, step_reporter
+from primdiffusion.commands.progress import EtaEstimator, ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel, warnings_of
 from primdiffusion.diffusion.samplers import RELEASED_END, SamplerStep
@@ -30,10 +30,10 @@ from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload
 from primdiffusion.editing.vary import vary_batch
 from primdiffusion.files.regular_files import check_unlinked
-from primdiffusion.files.whole_files import staged
+from primdiffusion.files.whole_files import atomic_folder
 from primdiffusion.formats.answers import HumanAnswer, VariationsAnswer
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
-from primdiffusion.human import Human, generate_batch, people_of
+from primdiffusion.human import Human, decode_humans, generate_batch
 from primdiffusion.human_file import load_human
 
 
@@ -62,13 +62,13 @@ def _generate_batch(
         for folder in folders:
             check_unlinked(folder)
     with contextlib.ExitStack() as files:
-        unfinished = [files.enter_context(staged(folder)) for folder in folders]
+        unfinished = [files.enter_context(atomic_folder(folder)) for folder in folders]
         report("load", 0, steps, None)
         model = session.model(request.checkpoint)
         report("sample", 0, steps, None)
 
         def decode(x0: Tensor) -> Human:
-            return people_of(model, x0[:1], seeds[:1], request.attributes)[0]
+            return decode_humans(model, x0[:1], seeds[:1], request.attributes)[0]
 
         released = request.compositing == "released" and request.sampler == "ddim"
         with step_previews(unfinished[0], request.picture_px, decode, request.compositing) as preview:
@@ -110,7 +110,7 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
     load_human and vary_batch.
     """
     began, warnings = time.perf_counter(), []
-    with staged(request.out_dir) as folder:
+    with atomic_folder(request.out_dir) as folder:
         report("load", 0, request.steps, None)
         model = session.model(request.checkpoint)
         report("sample", 0, request.steps, None)
@@ -133,11 +133,11 @@ def _sample_variations(
 ) -> list[Human]:
     """Sample the batch, and preview its humans in turn."""
     seeds, person = request.seeds, None if request.person is None else load_human(request.person)
-    pace, budget, turns = Pace(), PreviewBudget(INTERVAL_S / len(seeds)), itertools.cycle(range(len(seeds)))
+    pace, budget, turns = EtaEstimator(), PreviewBudget(INTERVAL_S / len(seeds)), itertools.cycle(range(len(seeds)))
 
     def decode(x0: Tensor, seed: int) -> Human:
         if person is None:
-            return people_of(model, x0, [seed], request.attributes)[0]
+            return decode_humans(model, x0, [seed], request.attributes)[0]
         return with_payload(model, person, x0)
 
     def on_step(step: SamplerStep) -> None:

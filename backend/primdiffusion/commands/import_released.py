@@ -19,7 +19,7 @@ from primdiffusion.diffusion.checkpoint import file_hash
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.files.tensor_file import under
-from primdiffusion.files.whole_files import replacing
+from primdiffusion.files.whole_files import atomic_replace
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
@@ -64,9 +64,11 @@ def import_released(command: ImportReleasedCommand, session: Session, report: Re
         card = _card(command.checkpoint, inventory, under(weights, PREFIX), command.reference, "denoiser")
     with contextlib.ExitStack() as all_or_none:
         if inventory.unet is not None:
-            out = all_or_none.enter_context(replacing(command.out))
+            out = all_or_none.enter_context(atomic_replace(command.out))
             write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, command.chain, card)
-        write_encoder(all_or_none.enter_context(replacing(encoder_out)), encoder, body_setup, reference, encoder_card)
+        write_encoder(
+            all_or_none.enter_context(atomic_replace(encoder_out)), encoder, body_setup, reference, encoder_card
+        )
     print(*notes, *files, sep="\n")
 
 

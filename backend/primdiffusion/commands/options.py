@@ -15,7 +15,7 @@ from primdiffusion.formats.requests import (
     GenerateRequest,
     InpaintRequest,
     InterpolateRequest,
-    Making,
+    PayloadMethod,
     Person,
     Pixels,
     PoseOptions,
@@ -122,7 +122,7 @@ class PayloadsCommand(MadePeople):
     """Folder to write person_NNNNNN.npz into; complete ones are skipped."""
     variants: Count = 4
     """Colourings of each human."""
-    making: Making = "fitted"
+    making: PayloadMethod = "fitted"
     """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
     takes the colour of the nearest surface point, 2 s, blurred."""
     checkpoint: Path | None = None

@@ -218,7 +218,7 @@ def draw(
     With released compositing its colours are sRGB-encoded.
     """
     if compositing == "released":
-        rendering = march_encoded(primitives, camera)
+        rendering = render_srgb(primitives, camera)
         rgba_to_png(path, decoded(rendering, background), background)
     else:
         rendering = march(primitives, camera)
@@ -226,7 +226,7 @@ def draw(
     return rendering
 
 
-def march_encoded(primitives: Primitives, camera: Camera) -> Rendering:
+def render_srgb(primitives: Primitives, camera: Camera) -> Rendering:
     """The rendering of the authors' code, which interpolates and composites colours in sRGB's encoding (SPEC 4)."""
     return march(dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb)), camera, RELEASED)
 

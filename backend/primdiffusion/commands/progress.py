@@ -34,7 +34,7 @@ _UNUSUAL = 3.0
 """Times the median: previews make a step longer, but less so."""
 
 
-class Pace:
+class EtaEstimator:
     """Estimates the time left from the last steps, without the first and those that take far longer than most: they
     load and compile."""
 
@@ -57,7 +57,7 @@ def step_reporter(
     report: ReportProgress, picture: Callable[[SamplerStep], Path | None]
 ) -> Callable[[SamplerStep], None]:
     """Return a function that reports a step with the seconds left and the path of its preview, if it has one."""
-    pace = Pace()
+    pace = EtaEstimator()
 
     def on_step(step: SamplerStep) -> None:
         path = picture(step)

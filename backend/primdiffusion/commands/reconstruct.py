@@ -27,7 +27,7 @@ from primdiffusion.commands.progress import ReportProgress, print_warnings
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel
-from primdiffusion.files.whole_files import staged
+from primdiffusion.files.whole_files import atomic_folder
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer, VariationFiles
 from primdiffusion.formats.requests import FitPostureRequest, Pictures, ReconstructRequest
 from primdiffusion.human import Human
@@ -57,7 +57,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
     captured_person.
     """
     began, warnings = time.perf_counter(), []
-    with staged(request.out_dir) as folder:
+    with atomic_folder(request.out_dir) as folder:
         report("load", 0, STAGES, None)
         by_encoder = request.capture is not None and request.by == "encoder"
         model = session.encoder(request.checkpoint) if by_encoder else session.model(request.checkpoint)
@@ -107,7 +107,7 @@ def _backs(request: ReconstructRequest, folder: Path) -> list[VariationFiles]:
 def fit_posture(request: FitPostureRequest, session: Session, report: ReportProgress) -> FitPostureAnswer:
     """Write posture.json, whole or not at all. Raises as `reconstruct`."""
     began = time.perf_counter()
-    with staged(request.out_dir) as folder:
+    with atomic_folder(request.out_dir) as folder:
         report("load", 0, 1, None)
         model = session.model(request.checkpoint)
         report("read", 0, 1, None)
@@ -125,7 +125,7 @@ def refine_human(command: RefineCommand, session: Session, report: ReportProgres
         ValueError, FileNotFoundError: captures, start or settings are missing, damaged or do not match; OSError.
     """
     settings = DescentSettings(command.steps, seed=command.seed)
-    with staged(command.out) as folder:
+    with atomic_folder(command.out) as folder:
         captures, name = choose_subject(command.capture, command.subject)
         person = captures.subject(name)
         betas = default_betas(person)

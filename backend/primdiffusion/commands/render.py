@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, default_body, pose_from_numbers, read_pose
-from primdiffusion.commands.output import decoded, march_encoded
+from primdiffusion.commands.output import decoded, render_srgb
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.drawing import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
@@ -21,7 +21,7 @@ from primdiffusion.drawing import draw as draw_scene
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.files.arrays import read_numbers
 from primdiffusion.files.regular_files import as_file_error
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.formats.answers import DrawAnswer, RenderAnswer
 from primdiffusion.formats.requests import DrawRequest, RenderRequest
 from primdiffusion.geometry.camera import Camera
@@ -230,13 +230,13 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     camera, background = framing(primitives, request.yaw_degrees, width, height), BACKGROUNDS[request.background]
     report("render", 0, 1, None)
     if request.compositing == "released":
-        rgba = decoded(march_encoded(primitives, camera), background)
+        rgba = decoded(render_srgb(primitives, camera), background)
     else:
         scene = Scene(primitives, chart=body_of(human)[1].chart)
         look = ViewSettings(request.view, settings=MarchSettings(step=request.step))
         rgba = torch.from_numpy(draw_scene(scene, camera, look).rgba)
     report("write", 1, 1, 0.0)
-    with written_whole(request.out) as file:
+    with atomic_path(request.out) as file:
         rgba_to_png(file, rgba, background)
     return RenderAnswer(out=request.out, seconds=round(time.perf_counter() - began, 3))
 

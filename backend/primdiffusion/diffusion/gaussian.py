@@ -28,8 +28,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.kinds import Block, expected, posterior
+from primdiffusion.geometry.records import TensorRecord
 
 IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""
@@ -37,6 +37,73 @@ CLEAN_NOISE = 1e-3
 """Noise of coefficients that are read as they are; some directions have no variance of their own."""
 TOGETHER, TOGETHER_ON_CUDA = 8, 32
 """Samples whose distances to all kinds are in memory at once; more on CUDA devices, where launches take the time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonComponents(TensorRecord):
+    """Latents [C, H, W] on K = H*W cells as P parts of N components (R = P*N), and a rest orthogonal to these."""
+
+    mean: Float[Tensor, "c h w"]
+    basis: Float[Tensor, "n k d"]
+    """Components, orthonormal in each part, in the order of their variance: [j, i] is what component j of a cell's
+    part adds to its d leading channels. Cells are in the order of their parts, `part.argsort(stable=True)`."""
+    part: Int[Tensor, "k"]
+    """Part of each cell, equal to its own mirror image; the last one is the head."""
+    parity: Float[Tensor, "r"]
+    """Sign of each coefficient in the mirror image of a person."""
+
+    def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
+        """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
+        centred = z - signal * self.mean
+        coefficients = self._along(centred)
+        return coefficients, centred - self.picture(coefficients)
+
+    def join(self, coefficients: Float[Tensor, "b r"], rest: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Latents of person coefficients and rest; the rest's share along the components is removed."""
+        return self.mean + rest + self.picture(coefficients - self._along(rest))
+
+    def outside(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The part orthogonal to the person components of latents without the mean."""
+        return z - self.picture(self._along(z))
+
+    def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
+        """Return the contribution of person coefficients to latents, without the mean."""
+        own = coefficients.unflatten(1, (-1, len(self.basis))).unbind(1)
+        drawn = torch.cat([part @ basis.flatten(1) for part, basis in zip(own, self.bases(), strict=True)], dim=1)
+        channels = self.basis.shape[2]
+        picture = coefficients.new_zeros((len(coefficients), *self.mean.flatten(1).shape))
+        picture[:, :channels, self._order] = drawn.unflatten(1, (-1, channels)).mT
+        return picture.unflatten(2, self.mean.shape[1:])
+
+    def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
+        cells = z.flatten(2)[:, : self.basis.shape[2], self._order].mT
+        own = cells.split([basis.shape[1] for basis in self.bases()], dim=1)
+        return torch.cat(
+            [part.flatten(1) @ basis.flatten(1).T for part, basis in zip(own, self.bases(), strict=True)], dim=1
+        )
+
+    @property
+    def _order(self) -> Int[Tensor, "k"]:
+        return self.part.argsort(stable=True)
+
+    def bases(self) -> tuple[Tensor, ...]:
+        """The components of each part [n, cells, d]."""
+        return self.basis.split(self._cells, dim=1)
+
+    @functools.cached_property
+    def _cells(self) -> list[int]:
+        """Cells of each part; waits for the device."""
+        return self.part.bincount().tolist()
+
+    def picture_variance(self, variance: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
+        """Variance of `picture` for independent coefficients of these variances."""
+        own = variance.unflatten(0, (-1, len(self.basis)))
+        drawn = torch.cat(
+            [torch.einsum("nkd,n->kd", basis.square(), part) for part, basis in zip(own, self.bases(), strict=True)]
+        )
+        picture = torch.zeros_like(self.mean).flatten(1)
+        picture[: drawn.shape[1], self._order] = drawn.T
+        return picture.view_as(self.mean)
 
 
 @dataclasses.dataclass(frozen=True)

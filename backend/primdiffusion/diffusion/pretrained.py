@@ -12,7 +12,7 @@ from primdiffusion.diffusion.checkpoint import FORMAT, WEIGHTS, read_card, read_
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.whole_files import staged
+from primdiffusion.files.whole_files import atomic_folder
 
 _SECTIONS = ("held_out_rms_x0_error", "limits")
 
@@ -97,7 +97,7 @@ def save_pretrained(model: DiffusionModel, folder: Path | str) -> Path:
             "this model was imported from the released weights and needs your body file: copy its checkpoint instead"
         )
     folder, schedule = Path(folder), schedule_name(model.schedule)
-    with staged(folder) as unfinished:
+    with atomic_folder(folder) as unfinished:
         weights = unfinished / WEIGHTS
         save_checkpoint(weights, model, schedule)
         metadata = read_metadata(weights, (FORMAT,))

@@ -110,7 +110,7 @@ MaskedSampler = Callable[
 ]
 DRAWS = 64
 """Of the person prior, to start from."""
-MASKED_SAMPLERS: Mapping[requests.Masking, MaskedSampler] = {"repaint": repaint, "released": paste_after_steps}
+MASKED_SAMPLERS: Mapping[requests.InpaintMethod, MaskedSampler] = {"repaint": repaint, "released": paste_after_steps}
 """Samplers of a region by name."""
 
 
@@ -124,7 +124,7 @@ def inpaint(
     attributes: Mapping[str, str | float] = MappingProxyType({}),
     guidance: float = requests.Conditioning.guidance,
     on_step: OnStep | None = None,
-    masking: requests.Masking = requests.InpaintRequest.masking,
+    masking: requests.InpaintMethod = requests.InpaintRequest.masking,
 ) -> Human:
     """Return the human with the primitives of a region resampled to fit the others (`repaint`).
 

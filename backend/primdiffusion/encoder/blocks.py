@@ -64,7 +64,7 @@ class UntiedConv(nn.Module):
         """Convolution and bias, without activation."""
         return self.convolution(x) + self.bias
 
-    def quiet(self) -> UntiedConv:
+    def small_init_(self) -> UntiedConv:
         """Scale the weights by 0.1 in place and return self, so that a residual branch starts close to zero."""
         with torch.no_grad():
             self.convolution.get_parameter("parametrizations.weight.original0").mul_(0.1)

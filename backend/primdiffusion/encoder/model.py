@@ -77,13 +77,13 @@ def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"], body_setup
     """
     device = encoder.scale_out.bias.device
     views, betas = views.to("cpu"), betas.cpu()
-    found = look_up(encoder.config, views, betas, body_setup)
+    found = unproject_views(encoder.config, views, betas, body_setup)
     axis_angle = motion_of(views.pose.joint_rotation)[None].to(device)
     payload = encoder(stack([found]).to(device), axis_angle)
     return payload.map(lambda tensor: tensor[0].float())
 
 
-def look_up(
+def unproject_views(
     config: EncoderConfig, views: Views, betas: Float[Tensor, "n"], body_setup: BodySetup | None = None
 ) -> Unprojected:
     """Unproject the images of one human in one pose to the input of an encoder with this configuration; on the CPU."""

@@ -84,7 +84,7 @@ class Encoder(nn.Module):
         self.density = MappingNetwork(config, config.density, S, conv)
         scale = (config.fused, *config.scale)
         self.scale = nn.ModuleList(conv(a, b, GRID) for a, b in itertools.pairwise(scale))
-        self.scale_out = conv(scale[-1], config.scale_outputs, GRID).quiet()
+        self.scale_out = conv(scale[-1], config.scale_outputs, GRID).small_init_()
 
     def forward(self, found: Unprojected, axis_angle: Float[Tensor, "b 24 3"]) -> Payload:
         """Payloads [b] from unprojected images [b, d, ...] and the poses of the subjects.
@@ -170,7 +170,7 @@ class MappingNetwork(nn.Module):
                 [
                     UntiedConv(config.stem[1], middle, SIDE // 4, kernel=1),
                     UntiedConv(config.stem[0], fine, SIDE // 2, kernel=1),
-                    UntiedConv(config.channels, layers, SIDE, kernel=1).quiet(),
+                    UntiedConv(config.channels, layers, SIDE, kernel=1).small_init_(),
                 ]
             )
         finest = config.finest if self.skips is not None else layers
@@ -181,7 +181,7 @@ class MappingNetwork(nn.Module):
                 conv(fine, finest, SIDE, "up"),
             ]
         )
-        self.out = UntiedConv(finest, layers, SIDE).quiet() if self.skips is not None else None
+        self.out = UntiedConv(finest, layers, SIDE).small_init_() if self.skips is not None else None
 
     def forward(self, fused: Float[Tensor, "b c 32 32"], fine: list[Tensor]) -> Float[Tensor, "b l 256 256"]:
         """`fine` holds the image encoder's levels, starting with its input; used only with skips."""

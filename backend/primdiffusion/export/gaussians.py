@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from primdiffusion.export.surface import depth_below
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.formats.requests import GaussiansRequest
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.records import TensorRecord
@@ -135,5 +135,5 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
     rows = torch.cat(columns, -1).detach().cpu().numpy().astype("<f4")
     names = "".join(f"property float {name}\n" for name in PROPERTIES)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         unfinished.write_bytes(header.encode() + np.ascontiguousarray(rows).tobytes())

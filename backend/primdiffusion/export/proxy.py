@@ -16,7 +16,7 @@ from torch import Tensor
 
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import VOXEL, ProxySettings
 from primdiffusion.geometry.image import encode_srgb
@@ -195,7 +195,7 @@ def write_proxy_glb(path: str | Path, proxy: MeshProxy, provenance: Mapping[str,
     Raises OSError.
     """
     proxy = proxy.on_floor()
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         unfinished.write_bytes(glb(proxy.mesh(), proxy.skeleton, {"primdiffusion": dict(provenance)}))
 
 

@@ -44,7 +44,7 @@ def array_names(path: str | Path) -> list[str]:
 
 def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
     """Return the shape of an array without reading its values. Raises as `read_arrays`."""
-    with _archive(path) as archive, archive.open(member := _needed(archive, path, name)) as stream:
+    with _archive(path) as archive, archive.open(member := _required_member(archive, path, name)) as stream:
         return _header(stream, member.file_size, path, name)
 
 
@@ -65,7 +65,7 @@ def read_arrays(
         for name in (*required, *optional):
             if name in optional and _member(archive, name) is None:
                 continue
-            member = _needed(archive, path, name)
+            member = _required_member(archive, path, name)
             unpacked, packed = unpacked + member.file_size, packed + member.compress_size
             _check_size(unpacked, packed, path, name)
             with archive.open(member) as stream:
@@ -129,7 +129,7 @@ def read_npy(path: str | Path) -> NDArray:
 def read_pickled_bytes(path: str | Path, name: str) -> bytes:
     """Return the pickle in an array of objects, for a reader that runs nothing of it. Raises as `read_arrays`."""
     with _archive(path) as archive:
-        member = _needed(archive, path, name)
+        member = _required_member(archive, path, name)
         _check_size(member.file_size, member.compress_size, path, name)
         with archive.open(member) as stream:
             _header(stream, member.file_size, path, name, kinds="O")
@@ -173,7 +173,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
     return archive.NameToInfo.get(f"{name}.npy") or archive.NameToInfo.get(name)
 
 
-def _needed(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.ZipInfo:
+def _required_member(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.ZipInfo:
     member = _member(archive, name)
     if member is None:
         raise FileError(path, f"holds no array {name!r}", "make it again")

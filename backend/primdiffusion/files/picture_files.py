@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .whole_files import replacing
+from .whole_files import atomic_replace
 
 DEPTH_UNIT = 0.00025
 """Metres per unit of a depth file, which reaches 16.38 m."""
@@ -32,7 +32,7 @@ def write_png(path: Path, pixels: NDArray) -> None:
     filtered = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)
     header = struct.pack(">IIBBBBB", width, height, bits, {(): 0, (3,): 2, (4,): 6}[pixels.shape[2:]], 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 6))]
-    with replacing(path) as partial, partial.open("wb") as file:
+    with atomic_replace(path) as partial, partial.open("wb") as file:
         file.write(_PNG)
         for kind, data in chunks:
             file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
@@ -47,7 +47,7 @@ def write_exr(path: Path, values: NDArray) -> None:
     header = _exr_header(*values.shape)
     chunks = [_exr_chunk(first, values[first : first + _EXR_LINES]) for first in range(0, len(values), _EXR_LINES)]
     sizes = [len(header) + 8 * len(chunks), *map(len, chunks[:-1])]
-    with replacing(path) as partial, partial.open("wb") as file:
+    with atomic_replace(path) as partial, partial.open("wb") as file:
         file.write(header)
         file.write(np.cumsum(sizes).astype("<u8").tobytes())
         file.writelines(chunks)

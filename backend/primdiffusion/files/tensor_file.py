@@ -27,7 +27,7 @@ _TYPES = (
     torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16, torch.int8,
     torch.uint8, torch.bool,
 )  # fmt: skip
-_MAKERS = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
+_TENSOR_FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
 _COPIES, _SMALL = 2, 100_000
 """Layers with weight normalisation make their weights twice; networks count and place with small tensors."""
 Network = TypeVar("Network", bound=nn.Module)
@@ -119,7 +119,7 @@ class ParameterLimit(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Count the values of a new tensor before it takes memory."""
         kwargs = kwargs or {}
-        if func in _MAKERS:
+        if func in _TENSOR_FACTORIES:
             size = (args or (kwargs["size"],))[0]
             self._left -= math.prod(args if isinstance(size, int) else size)
             if self._left < 0:

@@ -61,7 +61,7 @@ def remove_of_process(folder: Path, pid: int) -> None:
 
 
 @contextlib.contextmanager
-def written_whole(path: str | Path) -> Iterator[Path]:
+def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` to write to; it is renamed at the end, or removed after an error.
 
     A `path` that is such a temporary name is yielded itself. Raises OSError, naming `path`; PermissionError if it is a
@@ -87,15 +87,15 @@ def written_whole(path: str | Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
-    """`written_whole`, after creating the folder of `path`; in `folder`, if given, out of which no link may lead.
+def atomic_replace(path: Path, folder: Path | None = None) -> Iterator[Path]:
+    """`atomic_path`, after creating the folder of `path`; in `folder`, if given, out of which no link may lead.
 
     Raises FileError where one does.
     """
     if folder is not None:
         check_inside(path, folder)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         yield unfinished
 
 
@@ -104,12 +104,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
     Raises OSError, naming `path`.
     """
-    with replacing(path) as unfinished:
+    with atomic_replace(path) as unfinished:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
-def staged(folder: str | Path) -> Iterator[Path]:
+def atomic_folder(folder: str | Path) -> Iterator[Path]:
     """Yield a temporary folder inside `folder`, to which its files and folders move at the end, replacing those of the
     same names.
 

@@ -16,7 +16,7 @@ Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 Transfer = Literal["texture", "garment"]
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
-Masking = Literal["repaint", "released"]
+InpaintMethod = Literal["repaint", "released"]
 Compositing = Literal["linear", "released"]
 """How pictures are drawn: as in Blender, or as the authors' code draws them."""
 View = Literal["colour", "depth", "alpha", "boxes"]
@@ -32,7 +32,7 @@ SIDED_PARTS = (
 """Left and right as seen by the human."""
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
 """Body parts that regions consist of."""
-Making = Literal["fitted", "from_mesh"]
+PayloadMethod = Literal["fitted", "from_mesh"]
 """How payloads are made: fitted to renders of the mesh, or with the colours of the nearest surface point."""
 Reconstruction = Literal["encoder", "prior"]
 """How views become a human."""
@@ -224,7 +224,7 @@ class RegionRequest(EditRequest):
 class InpaintRequest(RegionRequest, Conditioning):
     """Resample a region of a human so that it fits the rest, for other clothes or hair."""
 
-    masking: Masking = "repaint"
+    masking: InpaintMethod = "repaint"
     """repaint: the rest is noised to each step's own level, and each step is sampled twice; released: as in the
     authors' code, the rest is pasted one level too noisy, and each step is sampled once."""
 

@@ -14,7 +14,12 @@ from primdiffusion.geometry.records import TensorRecord
 
 @dataclasses.dataclass(frozen=True)
 class Camera(TensorRecord):
-    """A camera, or a batch of cameras of one image size: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`."""
+    """A camera, or a batch of cameras of one image size: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`.
+
+    >>> pixels, depth = pd.framing(boxes).project(boxes.position)
+    >>> pixels.shape  # x from the left and y from the top of the picture
+    torch.Size([1024, 2])
+    """
 
     intrinsics: Float[Tensor, "*#c 3 3"]
     """Focal lengths and principal point, pixels."""

@@ -140,7 +140,7 @@ def under_hat(
     return centre[:, 1] > slope_x * centre[:, 0] + slope_z * centre[:, 2] + height
 
 
-def under_hem(
+def skin_under_hem(
     outfit: Float[np.ndarray, "O 3"], socks: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> np.ndarray:
     """Find the sock faces under trousers ([F] bool): those above the outfit's lowest point. Skirts cover none."""
@@ -224,7 +224,9 @@ def cover(assets: Assets, base: BaseMesh, path: str) -> Cover:
     return Cover(covered & (depth > strip), sink)
 
 
-def sunk(vertices: Float[np.ndarray, "B 3"], base: BaseMesh, covers: tuple[Cover, ...]) -> Float[np.ndarray, "B 3"]:
+def sink_below_cloth(
+    vertices: Float[np.ndarray, "B 3"], base: BaseMesh, covers: tuple[Cover, ...]
+) -> Float[np.ndarray, "B 3"]:
     """Sink the covered vertices of the body below its garments."""
     depth = np.max([garment.sink for garment in covers], axis=0)
     return vertices - depth[:, None] * vertex_normals(vertices, base.faces)

@@ -33,8 +33,8 @@ from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.files.arrays import read_arrays, write_deflated
-from primdiffusion.files.whole_files import written_whole
-from primdiffusion.formats.requests import Making
+from primdiffusion.files.whole_files import atomic_path
+from primdiffusion.formats.requests import PayloadMethod
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -52,7 +52,7 @@ from primdiffusion.runtime.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-VERSIONS: dict[Making, str] = {"fitted": "fitted 2", "from_mesh": "from_mesh 2"}
+VERSIONS: dict[PayloadMethod, str] = {"fitted": "fitted 2", "from_mesh": "from_mesh 2"}
 """Method and version stored in files, followed by the checkpoint for fits; those of others are made again."""
 GUESS_LEVEL = 100
 """Step at which the model denoises the mesh's own colours, to make the start of a fit."""
@@ -65,7 +65,7 @@ def make_payloads(
     variants: int,
     seed: int,
     workers: int,
-    making: Making = "fitted",
+    making: PayloadMethod = "fitted",
     checkpoint: Path | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
@@ -92,14 +92,14 @@ def make_payloads(
     done = count - len(jobs)
     report(done, count)
     work = [(assets, path, variants, person_seed, making, checkpoint) for path, person_seed in jobs]
-    for _ in each(write_person, work, workers):
+    for _ in each(write_payloads, work, workers):
         done += 1
         report(done, count)
     return paths
 
 
-def write_person(
-    assets: Assets, path: Path, variants: int, seed: int, making: Making, checkpoint: Path | None = None
+def write_payloads(
+    assets: Assets, path: Path, variants: int, seed: int, making: PayloadMethod, checkpoint: Path | None = None
 ) -> None:
     """Generate one sample in all colourings and write its file, atomically."""
     colourings = coloured_people(assets, seed, variants)
@@ -118,7 +118,7 @@ def write_person(
         "seed": seed,
         "making": _method(making, checkpoint),
     }
-    store_person(path, entries)
+    store_payloads(path, entries)
 
 
 @functools.lru_cache(maxsize=1)
@@ -126,7 +126,7 @@ def _model(checkpoint: Path | None) -> DiffusionModel:
     return load_checkpoint(checkpoint)
 
 
-def _method(making: Making, checkpoint: Path | None) -> str:
+def _method(making: PayloadMethod, checkpoint: Path | None) -> str:
     """Method and version for a file, with the checkpoint of a fit."""
     of_model = f" from {_model(checkpoint).card['sha256'][:12]}" if making == "fitted" else ""
     return VERSIONS[making] + of_model
@@ -138,9 +138,9 @@ def coloured_people(assets: Assets, seed: int, variants: int) -> list[Person]:
     return [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
 
 
-def store_person(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
+def store_payloads(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
     """Write a payload file, atomically, with `full_density` added. Raises OSError, which names the file."""
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         write_deflated(
             unfinished, {key: np.asarray(value) for key, value in {**entries, "full_density": FULL_DENSITY}.items()}
         )

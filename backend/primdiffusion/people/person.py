@@ -20,10 +20,10 @@ from primdiffusion.people.fitting import (
     item_skinning,
     lengthened,
     shown_faces,
+    sink_below_cloth,
+    skin_under_hem,
     skirt_faces,
-    sunk,
     under_hat,
-    under_hem,
     with_closed_hem,
 )
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
@@ -94,7 +94,7 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
     plain = np.full((1, 1, 4), 255, np.uint8)
     body = TexturedPart(
         "body",
-        sunk(vertices, base, covers),
+        sink_below_cloth(vertices, base, covers),
         base.faces[shown["body"]].astype(np.int32),
         base.corner_uv[shown["body"]],
         plain,
@@ -109,7 +109,7 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
     shoes = pairs["shoes"][1].faces
     sock_pieces = [number for number, piece in enumerate(choice.shoes.pieces) if piece.kind == "sock"]
     sock = np.isin(connected_faces(shoes, len(pairs["shoes"][1].vertices)), sock_pieces)
-    shown["shoes"] &= ~(sock & under_hem(fitted["outfit"], fitted["shoes"], shoes))
+    shown["shoes"] &= ~(sock & skin_under_hem(fitted["outfit"], fitted["shoes"], shoes))
     if choice.hair and choice.hat:
         shown["hair"] = ~under_hat(fitted["hat"], fitted["hair"], pairs["hair"][1].faces)
     for name, path in worn.items():

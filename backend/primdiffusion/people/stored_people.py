@@ -20,7 +20,7 @@ from primdiffusion.files.arrays import LARGEST_NUMBER, array_shape, read_arrays
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.geometry.image import decode_srgb
-from primdiffusion.people.wardrobe import words_of
+from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.primitives import K, Payload, S
 
 _ABOUT = ("betas", "attributes", "full_density")
@@ -55,7 +55,7 @@ def payload_of_bytes(
     return Payload(decode_srgb(values[..., :3, :, :, :]), values[..., 3, :, :, :] * full_density, delta_scale.float())
 
 
-def read_person(path: Path) -> PersonVariants:
+def read_payloads(path: Path) -> PersonVariants:
     """Read a file. Raises ValueError if it is damaged or of another shape."""
     with _damage_named(path):
         arrays = read_arrays(path, (*_ABOUT, *_COLOURINGS[0]), _COLOURINGS[1])
@@ -97,7 +97,7 @@ class Outline:
         """`PersonVariants.attributes`."""
         measures = measure(default_body().shape(self.betas))
         body = {"height": measures.height, "weight": measures.weight}
-        return tuple({**words_of(colouring), **body} for colouring in self.colourings())
+        return tuple({**attribute_labels(colouring), **body} for colouring in self.colourings())
 
 
 def _damage_named(path: Path) -> contextlib.AbstractContextManager[None]:
@@ -142,7 +142,7 @@ class PersonFolder:
             FileNotFoundError: there are fewer than two.
             ValueError: one is damaged, or people have several full densities.
         """
-        self.paths = find_people(folder)
+        self.paths = find_payloads(folder)
         self.outlines = [read_outline(path) for path in self.paths]
         self.names = [path.stem for path in self.paths]
         self.variants = [outline.variants for outline in self.outlines]
@@ -154,7 +154,7 @@ class PersonFolder:
 
     def person(self, index: int) -> PersonVariants:
         """Read a person. Raises ValueError, naming a damaged file, and OSError."""
-        return read_person(self.paths[index])
+        return read_payloads(self.paths[index])
 
     def variant(self, index: int, number: int) -> tuple[UInt8[Tensor, "k 8 8 8 4"], Float[Tensor, "k 3"]]:
         """Read voxels and delta scales of one colouring. Raises as `person`."""
@@ -164,7 +164,7 @@ class PersonFolder:
         return voxels[number], scale[number]
 
 
-def find_people(folder: Path) -> list[Path]:
+def find_payloads(folder: Path) -> list[Path]:
     """Return the files of a folder, sorted. Raises FileNotFoundError if there are fewer than two."""
     paths = sorted(folder.glob("*.npz"))
     if len(paths) < 2:

@@ -253,7 +253,7 @@ PLAIN = {"solid", "original", "fades"}
 """Values of `pattern` without a print on the top."""
 
 
-def words_of(attributes: Mapping[str, object]) -> dict[str, str]:
+def attribute_labels(attributes: Mapping[str, object]) -> dict[str, str]:
     """Convert attributes of `person.Person` to those that models are conditioned on; missing ones are left out.
 
     The result has sex, outfit, pattern, shoes, hair and hat.

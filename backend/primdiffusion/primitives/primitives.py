@@ -71,7 +71,11 @@ class Payload(TensorRecord):
 
 @dataclasses.dataclass(frozen=True)
 class Primitives(TensorRecord):
-    """Boxes of voxels in world space: the input of the marcher."""
+    """Boxes of voxels in world space: the input of the marcher.
+
+    >>> pd.Primitives.together([boxes, boxes]).density.shape  # two humans, to be drawn in one picture
+    torch.Size([2048, 8, 8, 8])
+    """
 
     position: Float[Tensor, "*b k 3"]
     rotation: Float[Tensor, "*b k 3 3"]

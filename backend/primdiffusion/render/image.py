@@ -12,7 +12,7 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from primdiffusion.files.whole_files import written_whole
+from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.records import TensorRecord
@@ -57,7 +57,7 @@ def depth_colours(depth: Float[ndarray, "*r"], near: float, far: float) -> Float
 
 
 def _save(path: str | Path, encoded: Float[Tensor, "h w c"]) -> None:
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         Image.fromarray(to_bytes(encoded).cpu().numpy()).save(unfinished, format="PNG")
 
 

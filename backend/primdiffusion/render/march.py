@@ -56,7 +56,7 @@ def march(
         shift = 0.5 - settings.pixel_centre
         camera = camera.moved_in_picture(shift, shift)
     batch = _batch_shape(primitives, camera, span)
-    if cuda.available(primitives.position.device) and cuda.suits(primitives, camera):
+    if cuda.available(primitives.position.device) and cuda.supports(primitives, camera):
         rendering = _march_at_once(primitives, camera, settings, span, batch)
     else:
         rendering = _march_one_by_one(primitives, camera, settings, span, batch)

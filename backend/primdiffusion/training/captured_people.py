@@ -25,8 +25,8 @@ from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.requests import EncodeSettings
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
-from primdiffusion.people.payloads import store_person, voxels_from_payload
-from primdiffusion.people.stored_people import read_person
+from primdiffusion.people.payloads import store_payloads, voxels_from_payload
+from primdiffusion.people.stored_people import read_payloads
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.failures import describe
@@ -87,7 +87,7 @@ def looks_of(
     if settings.refine_steps:
         frames = range(subject.frames)
         pictures = [conditioning_views(captures, name, frame, None, settings.refine_size) for frame in frames]
-    for frame in frames_of_looks(subject.frames, settings.looks):
+    for frame in choose_frames(subject.frames, settings.looks):
         cameras = spread_cameras(subject, frame, settings.views, model.body)
         payload = model.encode(conditioning_views(captures, name, frame, cameras), given).validate()
         if pictures:
@@ -97,7 +97,7 @@ def looks_of(
     return payloads, betas
 
 
-def frames_of_looks(frames: int, looks: int) -> list[int]:
+def choose_frames(frames: int, looks: int) -> list[int]:
     """Return `looks` evenly spaced frames from the first on, or all if there are fewer."""
     count = min(frames, looks)
     return [look * frames // count for look in range(count)]
@@ -135,13 +135,13 @@ def _store(path: Path, payloads: list[Payload], betas: Tensor, source: str, card
         "attributes": json.dumps(card.get("attributes", {})),
         "source": source,
     }
-    store_person(path, entries if card.get("seed") is None else {**entries, "seed": int(card["seed"])})
+    store_payloads(path, entries if card.get("seed") is None else {**entries, "seed": int(card["seed"])})
 
 
 def _is_current(path: Path, source: str, attributes: Mapping[str, Any]) -> bool:
     """Return whether a file is intact and of the same source and attributes."""
     try:
-        read_person(path)
+        read_payloads(path)
         stored = read_arrays(path, ("source", "attributes"))
         return str(stored["source"]) == source and parse_json(str(stored["attributes"])) == attributes
     except (FileNotFoundError, ValueError, KeyError):

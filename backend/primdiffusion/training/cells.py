@@ -55,11 +55,10 @@ def prepare(
     train: Sequence[int],
     held: Sequence[int],
     base: DiffusionModel | None = None,
-    more: PersonFolder | None = None,
 ) -> Prepared:
     """Return codec, latents, prior, shapes and surfaces of a run; loaded from the run folder if they are saved there.
 
-    With a `base` (`load_base`) all but the latents are those of that model. `more` are blurred people to train on.
+    With a `base` (`load_base`) all but the latents are those of that model.
 
     Raises ValueError for a person's file, or prepared ones, that are damaged, for people of another full density than
     the others or those of `base`, and for too few people; OSError.
@@ -67,19 +66,16 @@ def prepare(
     path = config.run / PREPARED
     if path.exists():
         return _load_prepared(path)
-    one_density([each.full_density for each in (people, more, base) if each is not None])
+    one_density([each.full_density for each in (people, base) if each is not None])
     if base is not None:
-        prepared = _prepared_with(base, people, train, held, more)
+        prepared = _prepared_with(base, people, train, held)
         _save_prepared(path, prepared)
         return prepared
-    _check_enough([people.variants[index] for index in train] + list(more.variants if more else ()), config.prior)
+    _check_enough([people.variants[index] for index in train], config.prior)
     generator = torch.Generator().manual_seed(config.seed)
-    known = [each for index in train for each in people.known(index)]
-    if more is not None:
-        known += [each for index in range(len(more.names)) for each in more.known(index)]
-    vocabulary = vocabulary_of(known)
+    vocabulary = vocabulary_of(each for index in train for each in people.known(index))
     codec = fit_codec_to(people, train, config.codec, generator)
-    latents, unseen = _encoded(people, train, held, more, codec, vocabulary)
+    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
     prior = fit_prior(latents, codec, vocabulary, config.prior)
     shapes = fit_shapes(latents, prior)
     surfaces = fit_surfaces(latents, codec, vocabulary, config.prior)
@@ -109,32 +105,11 @@ def load_base(path: Path) -> DiffusionModel:
     return model
 
 
-def _encoded(
-    people: PersonFolder,
-    train: Sequence[int],
-    held: Sequence[int],
-    more: PersonFolder | None,
-    codec: LinearCodec,
-    vocabulary: AttributeVocabulary,
-) -> tuple[LatentSet, LatentSet]:
-    """Latents to train on and held-out ones."""
-    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
-    if more is not None:
-        latents = latents.and_blurred(encode_people(more, range(len(more.names)), codec, vocabulary), codec)
-    return latents, unseen
-
-
-def _prepared_with(
-    base: DiffusionModel,
-    people: PersonFolder,
-    train: Sequence[int],
-    held: Sequence[int],
-    more: PersonFolder | None,
-) -> Prepared:
+def _prepared_with(base: DiffusionModel, people: PersonFolder, train: Sequence[int], held: Sequence[int]) -> Prepared:
     assert isinstance(base.codec, CellCodec)
     assert isinstance(base.denoiser, PersonDenoiser)
     codec, vocabulary = base.codec.codec, base.vocabulary
-    latents, unseen = _encoded(people, train, held, more, codec, vocabulary)
+    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
     return Prepared(
         latents, unseen, codec, base.denoiser.prior, base.shapes, base.surfaces, vocabulary, people.full_density
     )

@@ -134,9 +134,6 @@ class TrainingConfig(RunSettings):
     """Training set: a folder of `primdiffusion payloads`."""
     holdout: Annotated[float, Range(1e-6, 0.999999)] = 0.05
     """Fraction of geometries, with all their colour variants, held out for evaluation."""
-    more_data: Path | None = None
-    """More humans, of `payloads --making from_mesh`: cheap, so they can be many, but blurred. The default preset learns
-    from them what noise does not hide: the closed form, and its network at levels above t = 300."""
     preset: Literal["default", "paper"] = "default"
     """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
     made_of: Literal["makehuman", "own"] = "own"
@@ -178,9 +175,8 @@ class TrainingConfig(RunSettings):
         super().__post_init__()
         if self.preset == "paper" and self.slab.optimiser == "muon":
             raise ValueError("slab.optimiser is muon, which is for the default preset: choose adamw")
-        for name in ("start_from", "more_data"):
-            if self.preset == "paper" and getattr(self, name) is not None:
-                raise ValueError(f"{name} is for the default preset: leave it out, or give --preset default")
+        if self.preset == "paper" and self.start_from is not None:
+            raise ValueError("start_from is for the default preset: leave it out, or give --preset default")
 
 
 def to_json(config: Any) -> str:
@@ -192,7 +188,6 @@ MAY_CHANGE = frozenset(
     (
         "run",
         "data",
-        "more_data",
         "held",
         "made_of",
         "minutes",

@@ -84,8 +84,7 @@ def _task(
     if config.preset == "paper":
         return SlabTask(config, people, chosen, held, device)
     base = None if config.start_from is None else load_base(config.start_from)
-    more = None if config.more_data is None else PersonFolder(config.more_data)
-    return CellTask(config, prepare(config, people, chosen, held, base, more), device, base)
+    return CellTask(config, prepare(config, people, chosen, held, base), device, base)
 
 
 def _card(
@@ -121,8 +120,6 @@ def _card(
         card |= {"licence": "CC0-1.0", "data": DATA, "limits": _limits(config)}
     if isinstance(task, SlabTask):
         return {**card, "held_out_rms_x0_error": _rounded({"denoiser": task.errors()})}
-    if blurred := len(task.train.betas) - len(chosen):
-        card |= {"blurred_geometries": blurred}
     errors = task.errors_beside_closed_forms()
     better = all(errors["denoiser"][level] < errors["gaussian"][level] for level in errors["gaussian"])
     return {**card, "held_out_rms_x0_error": _rounded(errors), "beats_gaussian_at_every_level": better}

@@ -19,7 +19,7 @@ from primdiffusion.capture.dataset import (
 )
 from primdiffusion.capture.reader import Captures, Views
 from primdiffusion.encoder.config import EncoderConfig
-from primdiffusion.encoder.model import frames_of, look_up
+from primdiffusion.encoder.model import frames_of, unproject_views
 from primdiffusion.encoder.network import motion_of
 from primdiffusion.encoder.texture import eroded
 from primdiffusion.encoder.unproject import Unprojected
@@ -68,7 +68,7 @@ class FitDataset(SampleSet[FitSample]):
         sample = self.samples[position]
         given, target, betas = sample.conditioning, sample.target, self.betas[int(sample.subject)]
         return FitSample(
-            found=look_up(self.encoder, given, betas),
+            found=unproject_views(self.encoder, given, betas),
             axis_angle=motion_of(given.pose.joint_rotation),
             frames=frames_of(self.encoder, betas, target.pose)[1],
             target=eroded(target) if self.encoder.masks == "eroded" else target,

@@ -22,8 +22,6 @@ from primdiffusion.training.config import CodecConfig
 Item = TypeVar("Item", int, Path)
 CHUNK = 256
 """Samples whose latents are in float32 at once."""
-LARGEST_GAIN = 3.0
-"""By which a number of blurred people is multiplied at the most."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,36 +36,10 @@ class LatentSet(TensorRecord):
     condition: Float[Tensor, "n a"]
     """All attributes of each person, as `AttributeVocabulary.encode`."""
     detailed: Int[Tensor, ""]
-    """Number of samples to learn detail from; the others are blurred."""
+    """Number of samples to learn detail from; `renew_closed_form` appends softer ones."""
 
     def __len__(self) -> int:
         return len(self.latents)
-
-    def and_blurred(self, more: LatentSet, codec: LinearCodec) -> LatentSet:
-        """Append another set, whose samples are blurred; each number gets the mean and spread that it has here.
-
-        Otherwise generated people would be soft: at high levels, where both are learned, the chain would choose whether
-        a person is blurred, and the spread of fine detail would be too small.
-        """
-        (mean, std), (blurred_mean, blurred_std) = (_moments(each.latents, codec) for each in (self, more))
-        gain = (std / blurred_std.clamp_min(1e-6)).clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
-        alike = [(mean + (chunk.float() - blurred_mean) * gain).half() for chunk in more.latents.split(CHUNK)]
-        return LatentSet(
-            torch.cat([self.latents, *alike]),
-            torch.cat([self.geometry, more.geometry + len(self.betas)]),
-            torch.cat([self.betas, more.betas]),
-            torch.cat([self.condition, more.condition]),
-            self.detailed,
-        )
-
-
-def _moments(latents: Float[Tensor, "n c 32 32"], codec: LinearCodec) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of each number [C, 32, 32] over samples and their mirror images."""
-    chunks = latents.split(CHUNK)
-    mean = torch.stack([chunk.float().sum(0) for chunk in chunks]).sum(0) / len(latents)
-    mean = (mean + codec.mirror(mean)) / 2
-    square = torch.stack([(chunk.float() - mean).square().sum(0) for chunk in chunks]).sum(0) / len(latents)
-    return mean, ((square + codec.mirror(square).abs()) / 2).sqrt()
 
 
 def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[list[Item], list[Item]]:

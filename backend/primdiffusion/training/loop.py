@@ -33,13 +33,13 @@ from primdiffusion.files.json_files import parse_message
 from primdiffusion.runtime.failures import out_of_memory
 from primdiffusion.training.config import OptimiserSettings, RunSettings
 from primdiffusion.training.run_folder import PICTURES, STATE, Metrics, open_metrics
-from primdiffusion.training.state import TrainingState, adamw, agreed
+from primdiffusion.training.state import TrainingState, adamw, any_process_stops
 
 log = logging.getLogger(__name__)
 
-MEMORY = 25
+SMOOTHING_STEPS = 25
 """Approximate window of the running means in metrics.jsonl, steps."""
-IMPATIENT = 2.0
+FORCE_QUIT_AFTER_S = 2.0
 """Seconds after the first Ctrl-C before a second one stops at once: launchers forward the first one twice."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -135,7 +135,7 @@ def _train(
     saved, seconds = state.step, state.seconds
     began = last = time.monotonic()
     with Recorder(task, config, state, metrics) if metrics else contextlib.nullcontext() as recorder:
-        while state.step < steps and not agreed(accelerator, interrupt.due()):
+        while state.step < steps and not any_process_stops(accelerator, interrupt.due()):
             progress = take_step(task, config.seed, state)
             state.seconds = seconds + time.monotonic() - began
             if recorder is None:
@@ -233,7 +233,7 @@ class Recorder:
         row = {**progress.terms, "gradient": progress.gradient, "seconds_step": progress.seconds}
         for name, value in row.items():
             before = self.means.get(name, value)
-            self.means[name] = before + (value - before) / min(step, MEMORY)
+            self.means[name] = before + (value - before) / min(step, SMOOTHING_STEPS)
         self.state.place["means"] = json.dumps(self.means)
         self.bar.update()
         if self._due(self.config.log_every):
@@ -267,7 +267,7 @@ class Recorder:
 class Interrupt:
     """Stops loops after the current step: at a deadline, on SIGINT (Ctrl-C) or SIGTERM, so that no step is cut short.
 
-    A second Ctrl-C, IMPATIENT seconds later, raises KeyboardInterrupt wherever the loop is.
+    A second Ctrl-C, FORCE_QUIT_AFTER_S seconds later, raises KeyboardInterrupt wherever the loop is.
     """
 
     def __init__(self, minutes: float | None):
@@ -292,7 +292,7 @@ class Interrupt:
         if not self.pressed:
             log.info("stopping after this step")
             self.pressed, self._at = True, time.monotonic()
-        elif number == signal.SIGINT and time.monotonic() - self._at > IMPATIENT:
+        elif number == signal.SIGINT and time.monotonic() - self._at > FORCE_QUIT_AFTER_S:
             raise KeyboardInterrupt
 
     def due(self) -> bool:

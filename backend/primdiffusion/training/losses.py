@@ -30,8 +30,6 @@ LEVEL_MEDIAN, LEVEL_WIDTH = 2.0, 1.4
 deviation of its logarithm."""
 LOG_UNIFORM_SHARE = 0.2
 """Share of log-uniform levels among log-normal ones: no level stays untrained."""
-BLURRED_FROM = 300
-"""Step above which noise (1.2 of the signal and more) hides that people are blurred (by .03 in latents)."""
 
 
 def weighted_error(error: Float[Tensor, "b *s"], std: Float[Tensor, "b *s"]) -> Tensor:
@@ -71,7 +69,7 @@ class RestObjective:
         """Draw noisy people; return their rest, guessed coefficients, step, condition and clean rest."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
-        weights, indices = blends(self.people, t, self.config.blend, generator)
+        weights, indices = blends(self.people, len(t), self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
@@ -110,18 +108,16 @@ def random_steps(
 
 
 def blends(
-    people: LatentSet, t: Int[Tensor, "b"], share: float, generator: torch.Generator
+    people: LatentSet, count: int, share: float, generator: torch.Generator
 ) -> tuple[Float[Tensor, "b 2"], Int[Tensor, "b 2"]]:
     """Weights and indices of pairs of samples of one geometry; a `share` of pairs is mixed, the others are not.
 
-    Pairs for steps t up to BLURRED_FROM are detailed. Colourings of one geometry have the same density, so their
-    mixture is a valid sample of mixed colours. Weights exceed 0 ... 1 by so much that mixing preserves the variance of
-    colours: E[p^2 + (1-p)^2] = 1.
+    Colourings of one geometry have the same density, so their mixture is a valid sample of mixed colours. Weights
+    exceed 0 ... 1 by so much that mixing preserves the variance of colours: E[p^2 + (1-p)^2] = 1.
     """
     geometry = people.geometry
-    among = torch.where(t > BLURRED_FROM, len(people), people.detailed)
-    place, which, mixed, chosen = torch.rand(4, len(t), generator=generator, device=generator.device)
-    first = (place * among).long().clamp_max(among - 1)
+    place, which, mixed, chosen = torch.rand(4, count, generator=generator, device=generator.device)
+    first = (place * len(people)).long().clamp_max(len(people) - 1)
     counts = torch.bincount(geometry)
     starts = counts.cumsum(0) - counts
     own = geometry[first]

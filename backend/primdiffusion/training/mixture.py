@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.gaussian import IMPOSSIBLE
+from primdiffusion.diffusion.gaussian import IMPOSSIBLE, PersonComponents
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.regression import RIDGE, principal_directions, regress_cells
 

@@ -14,9 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.diffusion.codec import LinearCodec
-from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.gaussian import PersonComponents, PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.editing.regions import region_of
 from primdiffusion.training.config import PriorConfig

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.components import PersonComponents
+from primdiffusion.diffusion.gaussian import PersonComponents
 
 RIDGE = 4.0
 """People without any effect that every effect is estimated with."""

@@ -153,7 +153,7 @@ def accelerator_of(mixed_precision: str = "no") -> Accelerator:
     return Accelerator(mixed_precision=mixed_precision, cpu=on_cpu, kwargs_handlers=[patience])
 
 
-def agreed(accelerator: Accelerator, stop: bool) -> bool:
+def any_process_stops(accelerator: Accelerator, stop: bool) -> bool:
     """Return whether any process asks to stop: all must leave a loop after the same step."""
     if accelerator.num_processes == 1:
         return stop

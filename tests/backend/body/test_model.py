@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 import smplx
 import torch
-from primdiffusion.body.model import BodyModel, BodyPose, J, default_body, pose_from_numbers, read_pose
+from primdiffusion.body.model import (
+    BodyModel,
+    BodyPose,
+    J,
+    betas_of_measures,
+    default_body,
+    measure,
+    pose_from_numbers,
+    read_pose,
+)
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.people.base_mesh import load_base_mesh
 from smplx.lbs import lbs
 from support.errors import refused
@@ -81,13 +89,6 @@ def test_pose_blend_shapes_agree_with_smplx():
     assert (posed.vertices - without.vertices).abs().max() > 0.01
 
 
-def test_rest_pose_returns_the_shaped_body():
-    shaped = default_body().shape(torch.randn(10, generator=torch.Generator().manual_seed(0)))
-    posed = shaped.pose(BodyPose.rest())
-    torch.testing.assert_close(posed.vertices, shaped.vertices, atol=1e-6, rtol=0)
-    torch.testing.assert_close(posed.joints[:, :3, 3], shaped.joints, atol=1e-6, rtol=0)
-
-
 def test_bending_an_elbow_turns_the_hand_by_hand_count():
     body = default_body()
     theta = torch.zeros(J, 3)
@@ -100,18 +101,6 @@ def test_bending_an_elbow_turns_the_hand_by_hand_count():
     torch.testing.assert_close(moved, torch.stack([-dy, dx, dz]), atol=1e-6, rtol=0)
     still = body.skin_weights[:, [elbow, wrist, JOINT_NAMES.index("left_hand")]].sum(1) == 0
     torch.testing.assert_close(posed.vertices[still], shaped.vertices[still], atol=1e-6, rtol=0)
-
-
-def test_turning_the_pelvis_turns_the_whole_body_rigidly():
-    betas, theta, translation = random_people(1, seed=5)
-    shaped = default_body().shape(betas[0])
-    pose = BodyPose.from_axis_angle(theta[0], translation[0])
-    turn = axis_angle_to_matrix(torch.tensor([0.3, -1.1, 0.4]))
-    turned_rotation = torch.cat([(turn @ pose.joint_rotation[:1]), pose.joint_rotation[1:]])
-    pelvis = shaped.joints[0]
-    moved_pelvis = turn @ (pelvis + translation[0])
-    turned = shaped.pose(BodyPose(turned_rotation, moved_pelvis - pelvis))
-    torch.testing.assert_close(turned.vertices, shaped.pose(pose).vertices @ turn.T, atol=2e-6, rtol=0)
 
 
 def test_batches_of_bodies_and_poses_broadcast():
@@ -332,3 +321,38 @@ def test_a_frame_beyond_the_end_is_rejected(tmp_path):
     np.savez(path, poses=np.zeros((2, 72)))
     with refused(ValueError, "one.npz"):
         read_pose(path, frame=2)
+
+
+def test_a_person_is_as_tall_as_their_vertices_and_as_heavy_as_their_volume():
+    import trimesh
+
+    shape = default_body().shape(torch.tensor([0.5, -1.0, 0.3]))
+    mesh = trimesh.Trimesh(shape.vertices.numpy(), default_body().faces.numpy(), process=False)
+    height, weight = measure(shape)
+    assert height == pytest.approx(mesh.extents[1], abs=1e-5)
+    assert weight == pytest.approx(985 * mesh.volume, rel=1e-4)
+    assert 1.5 < height < 2.1
+    assert 40 < weight < 120
+
+
+@pytest.mark.parametrize(("height", "weight"), [(1.6, None), (None, 80.0), (1.9, 95.0), (None, None)])
+def test_bodies_of_given_measures_have_them(height, weight):
+    betas = torch.linspace(-1, 1, 10)
+    moved = betas_of_measures(betas, torch.eye(10), default_body(), height, weight)
+    measured = measure(default_body().shape(moved))
+    assert height is None or measured.height == pytest.approx(height, abs=2e-4)
+    assert weight is None or measured.weight == pytest.approx(weight, abs=2e-2)
+    assert (moved - betas).norm() < 5
+
+
+def test_a_change_follows_the_shapes_that_people_have():
+    # where only the first two betas vary, only they give way
+    scale = torch.diag(torch.tensor([1.0, 1.0, *[0.0] * 8]))
+    moved = betas_of_measures(torch.zeros(10), scale, default_body(), height=1.8, weight=75.0)
+    assert torch.equal(moved[2:], torch.zeros(8))
+    assert (moved[:2] != 0).all()
+
+
+def test_bodies_that_no_human_has_are_rejected():
+    with refused(ValueError, "2.60", "30 kg"):
+        betas_of_measures(torch.zeros(10), torch.eye(10), default_body(), 2.6, 30.0)

@@ -162,19 +162,6 @@ class Hostile:
         return self.call
 
 
-@pytest.mark.parametrize("protocol", range(6))
-@pytest.mark.parametrize("where", ["v_template", "bs_style", "extra"])
-def test_hostile_pickle_is_rejected_by_name_and_does_not_run(tmp_path, protocol, where):
-    trace = tmp_path / "trace"
-    content = {**smpl_arrays(), where: Hostile(pathlib.os.mkdir, str(trace))}
-    path = pickled(tmp_path, content, protocol)
-    with refused(FileError, ".mkdir"):
-        load_body(path, uv=path)
-    assert not trace.exists()
-    pickle.loads(path.read_bytes())  # the same bytes do harm where nobody holds them back
-    assert trace.exists()
-
-
 @pytest.mark.parametrize(
     "program",
     [

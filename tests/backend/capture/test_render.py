@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 from capture_scenes import captured, save_person, small_job
 from primdiffusion import cli
@@ -20,7 +19,6 @@ from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from support.capture_files import faults
 from support.errors import refused
-from support.runs import within
 
 NAMES = ["person_000000", "person_000001"]
 
@@ -100,39 +98,13 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=6)))
 
 @pytest.mark.parametrize("folder", ["img", "outputs_re_fitting", ""])
 def test_no_worker_writes_through_a_link_in_the_folder_of_a_human(tmp_path, folder):
-    outside, job = tmp_path / "outside", small_job(tmp_path)
+    outside, job = tmp_path / "outside", small_job(tmp_path, people=1)
     outside.mkdir()
     capture_layout.claim(job.out, job.about)
     (job.out / NAMES[0] / folder).parent.mkdir(exist_ok=True)
     (job.out / NAMES[0] / folder).symlink_to(outside)
     assert {outcome.subject: outcome.status for outcome in render(job)}[NAMES[0]] == "failed"
     assert not list(outside.iterdir())
-
-
-def test_workers_end_when_the_command_is_killed(tmp_path):
-    save_person(tmp_path / "people" / "p0" / "person.glb")
-    save_person(tmp_path / "people" / "p1" / "person.glb")
-    line = [
-        "captures",
-        "render",
-        "--people",
-        tmp_path / "people",
-        "--out",
-        tmp_path / "out",
-        "--workers",
-        "2",
-        "--size",
-        "64",
-    ]
-    process = subprocess.Popen([sys.executable, "-m", "primdiffusion.cli", *line], stdout=subprocess.DEVNULL)
-    try:
-        assert within(300, lambda: list((tmp_path / "out").glob("*/img/*/*.jpg")))
-        workers = psutil.Process(process.pid).children(recursive=True)
-        assert len(workers) >= 2
-    finally:
-        process.kill()
-        process.wait()
-    assert within(300, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
 
 
 def test_a_file_of_poses_that_cannot_be_read_is_named_before_anything_is_rendered(tmp_path, fails):

@@ -9,7 +9,7 @@ import pytest
 from primdiffusion.commands import progress as module
 from primdiffusion.commands.command_line import parse
 from primdiffusion.commands.options import OPTIONS
-from primdiffusion.commands.progress import Pace
+from primdiffusion.commands.progress import EtaEstimator
 from primdiffusion.formats.requests import Attributes, GenerateRequest
 from primdiffusion.formats.schema import FieldError, Option, Range
 
@@ -81,7 +81,7 @@ def test_every_command_has_help(name, capsys):
 
 def paced(monkeypatch, steps: list[float]) -> list[float | None]:
     """Estimates after steps of these seconds."""
-    now, pace, found = 0.0, Pace(), []
+    now, pace, found = 0.0, EtaEstimator(), []
     for done, step in enumerate(steps, 1):
         now += step
         monkeypatch.setattr(module.time, "perf_counter", lambda now=now: now)

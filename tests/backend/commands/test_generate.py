@@ -17,7 +17,7 @@ from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.samplers import RELEASED_END
 from primdiffusion.formats.requests import Conditioning, GenerateRequest
 from primdiffusion.geometry.image import encode_srgb
-from primdiffusion.human import framing, people_of, place
+from primdiffusion.human import decode_humans, framing, place
 from primdiffusion.human import generate as generate_human
 from primdiffusion.human_file import load_human
 from primdiffusion.render.march import RELEASED
@@ -95,7 +95,7 @@ def test_released_compositing_keeps_the_noise_of_ddims_last_level_and_encodes_pr
     *_, before, end = sample(model, [3], 4, "ddim", None, Conditioning.guidance)
     noise = (before.x - schedule.alpha_bar[end.t].sqrt() * end.x0) / (1 - schedule.alpha_bar[end.t]).sqrt()
     left = schedule.alpha_bar[0].sqrt() * end.x0 + (1 - schedule.alpha_bar[0]).sqrt() * noise
-    (expected,) = people_of(model, left.to(end.x0), [3])
+    (expected,) = decode_humans(model, left.to(end.x0), [3])
     found = {name: load_human(tmp_path / name / "person.human.safetensors") for name in ("linear", "released")}
     assert (found["released"].payload.rgb - expected.payload.rgb).abs().max() < 1e-4
     assert (found["released"].payload.rgb - found["linear"].payload.rgb).abs().max() > 1e-3

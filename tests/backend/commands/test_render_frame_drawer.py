@@ -15,7 +15,6 @@ from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
-from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.runtime.failures import describe
 from support.tiny import tiny_model
@@ -121,24 +120,6 @@ def test_people_are_loaded_once_and_placed_once_a_pose(params, monkeypatch, tmp_
     os.utime(params.people[0].human, ns=(1, 1))
     drawn(params, drawer)
     assert sorted(calls) == ["load_human"] * 2 + ["place_skinned"] * 3, "a file that has changed is read again"
-
-
-def test_several_people_stand_in_one_picture(human, pose, params):
-    beside = [[1.0, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, -0.5]]
-    two = dataclasses.replace(params, people=[params.people[0], dataclasses.replace(params.people[0], object=beside)])
-    first = place(human, pose)
-    second = dataclasses.replace(first, position=first.position + torch.tensor([0.3, 0, -0.5]))
-    camera = framing(first, 23, WIDTH, HEIGHT)
-    want = draw(Scene(Primitives.together([first, second])), camera, ViewSettings())
-    alone = draw(Scene(first), camera, ViewSettings())
-    assert np.allclose(drawn(two).rgba, want.rgba, atol=2e-3)
-    assert want.alpha.mean() > 1.2 * alone.alpha.mean()
-
-
-def test_no_human_is_a_picture_too(params):
-    empty = drawn(dataclasses.replace(params, people=[], background=[0.1, 0.2, 0.3]))
-    assert np.allclose(empty.rgba, (0.1, 0.2, 0.3, 1))
-    assert (empty.depth == np.float32(1e10)).all()
 
 
 def test_solids_come_from_a_file_of_plain_arrays_and_are_read_again_when_it_changes(params, tmp_path):

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from primdiffusion.body.model import default_body
 from primdiffusion.editing.regions import (
     DISJOINT,
@@ -164,14 +166,21 @@ def test_an_invalid_mask_is_rejected(region, fact):
         check_region(region)
 
 
-def test_a_region_is_serialised_by_its_parts_or_bit_by_bit():
-    assert name_region(region_of(["top"])) == ["top"]
-    assert name_region(region_of(["hair", "hands"])) == ["hair", "left_hand", "right_hand"]
-    painted = region_of(["top"])
-    painted[7] = True
-    bits = name_region(painted)
-    assert isinstance(bits, str)
-    assert [bit == "1" for bit in f"{int(bits, 16):01024b}"] == painted.tolist()
+@given(st.sets(st.sampled_from(DISJOINT), min_size=1), st.sets(st.integers(0, K - 1)))
+def test_a_region_is_serialised_by_its_parts_or_bit_by_bit(parts, painted):
+    region = region_of(sorted(parts))
+    region[sorted(painted)] ^= True
+    name = name_region(region)
+    if isinstance(name, str):
+        assert [bit == "1" for bit in f"{int(name, 16):01024b}"] == region.tolist()
+    else:
+        assert torch.equal(region_of(name), region)
+    assert isinstance(name, list) or painted
+
+
+@given(st.lists(st.sampled_from(PARTS), min_size=1, max_size=4))
+def test_a_region_of_several_parts_is_all_of_each(parts):
+    assert torch.equal(region_of(parts), torch.stack([region_of([part]) for part in parts]).any(0))
 
 
 def test_another_bodys_people_have_parts_too():

@@ -21,8 +21,8 @@ from primdiffusion.encoder.model import (
     encode,
     frames_of,
     load_encoder,
-    look_up,
     save_encoder,
+    unproject_views,
 )
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.encoder.unproject import unproject_voxels
@@ -65,7 +65,7 @@ def test_pictures_without_the_person_still_give_finite_values():
 @pytest.mark.parametrize("betas", [torch.zeros(9), torch.zeros(2, 10), torch.full((10,), torch.nan)])
 def test_betas_of_another_body_are_rejected(betas):
     with refused(ValueError, "10 finite"):
-        look_up(TINY, blank_views(), betas.reshape(-1) if betas.ndim > 1 else betas)
+        unproject_views(TINY, blank_views(), betas.reshape(-1) if betas.ndim > 1 else betas)
 
 
 def test_poses_that_are_not_finite_are_rejected():
@@ -84,7 +84,7 @@ def test_voxels_are_looked_up_where_the_marcher_will_draw_them():
     payload = tiny_encoder().encode(views, betas)
     vertices, _ = frames_of(encoder.config, betas, views.pose)
     drawn = tiny_encoder().place(payload, betas, views.pose)
-    found = look_up(encoder.config, views, betas)
+    found = unproject_views(encoder.config, views, betas)
     assert (payload.delta_scale / found.extent - 1).abs().max() < 0.1  # nothing is learned yet
     rest = Frames(drawn.position, drawn.rotation, drawn.half_extent / payload.delta_scale)
     there = unproject_voxels(views, vertices, rest, found.extent, encoder.config.facing)
@@ -197,12 +197,6 @@ def test_weights_that_half_precision_cannot_hold_replace_no_file(saved, tmp_path
         save_encoder(path, EncoderModel(encoder, {}))
     assert path.read_bytes() == saved.read_bytes()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_configurations_come_back_from_json(preset):
-    config = PRESETS[preset]
-    assert config_from_json(json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
 def test_unknown_and_missing_settings_are_rejected_by_name():

@@ -10,7 +10,7 @@ from primdiffusion.body.model import BodyModel, BodyPose, J
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.config import RELEASED
-from primdiffusion.encoder.model import look_up
+from primdiffusion.encoder.model import unproject_views
 from primdiffusion.encoder.texture import BESIDE, TEXTURE_SIDE, eroded, sample_both_sides, unproject_texture
 from primdiffusion.encoder.unproject import SIDE
 from primdiffusion.geometry.camera import Camera, look_at
@@ -150,10 +150,10 @@ def test_masks_are_eroded_only_if_the_configuration_says_so():
     views.rgba[:, 8:24, 8:24, 3] = 255
     whole = dataclasses.replace(RELEASED, masks="whole")
     betas = torch.zeros(10)
-    expected = look_up(whole, eroded(views), betas)
-    found = look_up(RELEASED, views, betas)
+    expected = unproject_views(whole, eroded(views), betas)
+    found = unproject_views(RELEASED, views, betas)
     assert torch.equal(found.rgb, expected.rgb)
-    assert not torch.equal(found.rgb, look_up(whole, views, betas).rgb)
+    assert not torch.equal(found.rgb, unproject_views(whole, views, betas).rgb)
 
 
 def test_pixels_beside_the_person_are_black_and_count():

@@ -342,11 +342,11 @@ def assert_rejected(
     message: str, views: Views | None = None, vertices=POSED, frames: Frames | None = None, body=None
 ) -> None:
     views = person_views() if views is None else views
-    look_up = (lambda: unproject_texels(views, vertices, 2, body)) if frames is None else (
+    unproject_views = (lambda: unproject_texels(views, vertices, 2, body)) if frames is None else (
         lambda: unproject_voxels(views, vertices, frames, ONES, 2)
     )  # fmt: skip
     with pytest.raises(ValueError, match=message):
-        look_up()
+        unproject_views()
 
 
 def test_views_that_are_none_batched_or_no_bytes_are_rejected():

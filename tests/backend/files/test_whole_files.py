@@ -12,13 +12,13 @@ from primdiffusion.files.json_files import parse_json, parse_message, read_json
 from primdiffusion.files.regular_files import FileError, is_local_path
 from primdiffusion.files.whole_files import (
     ABANDONED_AFTER_S,
+    atomic_folder,
+    atomic_path,
+    atomic_replace,
     publish,
     remove_abandoned,
     remove_of_process,
-    replacing,
-    staged,
     temporary_name,
-    written_whole,
 )
 from support.errors import refused
 
@@ -39,7 +39,7 @@ def contents(folder: Path) -> dict[str, str]:
 def test_files_arrive_together_and_replace_older_ones(tmp_path):
     target = tmp_path / "new" / "folder"
     for text in ("one", "two"):
-        with staged(target) as aside:
+        with atomic_folder(target) as aside:
             (aside / "a").write_text(text)
             (aside / "b").write_text(text)
             if text == "two":
@@ -52,7 +52,7 @@ def test_no_file_is_written_through_a_link_out_of_the_folder(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "textures").symlink_to(tmp_path / "outside")
     path = tmp_path / "out" / "textures" / "a.png"
-    with refused(FileError, "a.png"), replacing(path, tmp_path / "out") as unfinished:
+    with refused(FileError, "a.png"), atomic_replace(path, tmp_path / "out") as unfinished:
         unfinished.write_text("mine")
     assert not list((tmp_path / "outside").iterdir())
 
@@ -63,7 +63,7 @@ def test_an_error_leaves_an_old_folder_as_it_was_and_no_new_one(tmp_path):
     (old / "a").write_text("kept")
     for target in (old, tmp_path / "new" / "deep"):
         with pytest.raises(RuntimeError):
-            half_done(staged(target))
+            half_done(atomic_folder(target))
     assert [path.name for path in tmp_path.iterdir()] == ["old"]
     assert contents(old) == {"a": "kept"}
 
@@ -72,7 +72,7 @@ def test_a_folder_in_place_of_one_file_keeps_all_others(tmp_path):
     (tmp_path / "b").mkdir(parents=True)
     (tmp_path / "a").write_text("kept")
     with contextlib.ExitStack() as files:
-        aside = files.enter_context(staged(tmp_path))
+        aside = files.enter_context(atomic_folder(tmp_path))
         for name in "abc":
             (aside / name).write_text("new")
         with pytest.raises(IsADirectoryError) as error:
@@ -103,7 +103,7 @@ def test_what_is_a_day_old_goes_with_the_next_writing_but_not_what_may_be_writte
     other.touch()
     for path in (old / "half", old, other):
         os.utime(path, (0, os.stat(path).st_mtime - ABANDONED_AFTER_S - 1))
-    with written_whole(tmp_path / "files") as path:
+    with atomic_path(tmp_path / "files") as path:
         path.touch()
     assert sorted(tmp_path.iterdir()) == sorted((young, other, tmp_path / "files"))
     remove_abandoned(tmp_path)
@@ -125,7 +125,7 @@ def test_a_file_in_the_way_is_an_error_before_any_work(tmp_path, below):
     blocked = tmp_path / "file"
     blocked.write_text("content")
     began = False
-    with refused(OSError, "file"), staged(blocked / below):
+    with refused(OSError, "file"), atomic_folder(blocked / below):
         began = True
     assert not began
     assert blocked.read_text() == "content"
@@ -133,31 +133,31 @@ def test_a_file_in_the_way_is_an_error_before_any_work(tmp_path, below):
 
 def test_a_single_file_is_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "file"
-    with written_whole(path) as unfinished:
+    with atomic_path(path) as unfinished:
         unfinished.write_text("one")
         assert not path.exists()
     with pytest.raises(RuntimeError):
-        half_done(written_whole(path))
+        half_done(atomic_path(path))
     assert path.read_text() == "one"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_temporary_file_needs_no_other(tmp_path):
-    with written_whole(tmp_path / "a.png") as outer:
-        with written_whole(outer) as inner:
+    with atomic_path(tmp_path / "a.png") as outer:
+        with atomic_path(outer) as inner:
             inner.write_text("x")
         assert (inner, list(tmp_path.iterdir())) == (outer, [outer])
     assert contents(tmp_path) == {"a.png": "x"}
 
 
 def test_errors_name_the_file_that_was_asked_for(tmp_path):
-    with pytest.raises(FileNotFoundError) as missing, written_whole(tmp_path / "no" / "a") as unfinished:
+    with pytest.raises(FileNotFoundError) as missing, atomic_path(tmp_path / "no" / "a") as unfinished:
         unfinished.write_text("x")
     assert missing.value.filename == str(tmp_path / "no" / "a")
-    with refused(OSError, "space") as full, written_whole(tmp_path / "a"):
+    with refused(OSError, "space") as full, atomic_path(tmp_path / "a"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert full.value.filename == str(tmp_path / "a")
-    with refused(PermissionError, "elsewhere"), written_whole(tmp_path / "a"):
+    with refused(PermissionError, "elsewhere"), atomic_path(tmp_path / "a"):
         raise PermissionError(errno.EPERM, "not permitted", "elsewhere")
     assert not list(tmp_path.iterdir())
 
@@ -167,7 +167,7 @@ def test_folders_and_devices_are_not_replaced(tmp_path):
     """Who may do anything, as the administrator may, would otherwise lose a device to a picture."""
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path, tmp_path / "pipe"):
-        with refused(PermissionError, "regular"), written_whole(place):
+        with refused(PermissionError, "regular"), atomic_path(place):
             pass
     assert [entry.name for entry in tmp_path.iterdir()] == ["pipe"]
 

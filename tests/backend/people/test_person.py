@@ -1,7 +1,6 @@
 """Whole people: these need a MakeHuman asset folder and skip without one."""
 
 import json
-import os
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
 from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, open_assets, parse_mhclo
 from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.fitting import shown_faces, skirt_faces, under_hat, under_hem
+from primdiffusion.people.fitting import shown_faces, skin_under_hem, skirt_faces, under_hat
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
 from primdiffusion.people.person import make_person, recolour
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body
@@ -101,8 +100,8 @@ def test_hat_covers_hair_above_its_tilted_brim():
 
 def test_socks_end_under_trousers_but_not_under_skirts():
     sock, face = np.array([[0.0, 0.1, 0], [0, 0.2, 0]]), np.array([[0, 0, 0], [1, 1, 1]])
-    assert under_hem(np.array([[0.0, 0.12, 0], [0, 1, 0]]), sock, face).tolist() == [False, True]
-    assert under_hem(np.array([[0.0, 0.6, 0], [0, 1, 0]]), sock, face).tolist() == [False, False]
+    assert skin_under_hem(np.array([[0.0, 0.12, 0], [0, 1, 0]]), sock, face).tolist() == [False, True]
+    assert skin_under_hem(np.array([[0.0, 0.6, 0], [0, 1, 0]]), sock, face).tolist() == [False, False]
 
 
 def test_femininity_separates_the_bodies_the_shape_space_was_made_from(base):
@@ -292,20 +291,3 @@ def test_fits_look_more_like_the_mesh_from_sides_not_shown_and_from_a_guess_leav
 def test_counts_that_make_nothing_are_rejected(tmp_path):
     with refused(ValueError, "variants is 0"):
         make_payloads(assets_module.Assets(tmp_path), tmp_path, 1, 0, 0, 1)
-
-
-@pytest.mark.slow
-def test_processes_make_the_same_files_as_one(assets, tmp_path):
-    environment = dict(os.environ)
-    alone = make_payloads(assets, tmp_path / "one", 3, 1, 11, 1, "from_mesh")
-    reports = []
-    together = make_payloads(
-        assets, tmp_path / "two", 3, 1, 11, 2, "from_mesh", report=lambda done, total: reports.append(done)
-    )
-    assert [path.name for path in together] == [path.name for path in alone]
-    assert reports[0] == 0
-    assert reports[-1] == 3
-    assert dict(os.environ) == environment
-    for first, second in zip(alone, together, strict=True):
-        with np.load(first) as a, np.load(second) as b:
-            assert np.array_equal(a["voxels"], b["voxels"])

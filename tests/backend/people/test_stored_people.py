@@ -8,7 +8,7 @@ import pytest
 import torch
 from diffusion_people import write_people
 from primdiffusion.geometry.image import encode_srgb
-from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
+from primdiffusion.people.stored_people import PersonFolder, find_payloads, read_outline, read_payloads
 from primdiffusion.primitives.primitives import K
 from support.errors import refused
 
@@ -22,7 +22,7 @@ def people(tmp_path_factory) -> Path:
 
 def test_an_empty_folder_is_rejected(tmp_path):
     with refused(FileNotFoundError, "primdiffusion"):
-        find_people(tmp_path)
+        find_payloads(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_an_empty_folder_is_rejected(tmp_path):
 def test_content_that_cannot_be_a_human_is_one_sentence(tmp_path, people, change):
     with np.load(people / "person_000000.npz") as stored:
         np.savez(tmp_path / "person_000009.npz", **{**stored, **change})
-    for read in (read_person, read_outline):
+    for read in (read_payloads, read_outline):
         with refused(ValueError, "person_000009.npz") as raised:
             read(tmp_path / "person_000009.npz")
         assert len(str(raised.value)) - len(str(tmp_path)) < 300
@@ -56,7 +56,7 @@ def test_a_header_that_promises_many_humans_is_not_believed(tmp_path, people):
     header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (50000000, 1024, 8, 8, 8, 4), }\n"
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("voxels.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
-    for read in (read_person, read_outline):
+    for read in (read_payloads, read_outline):
         with refused(ValueError, path.name, "claims the shape"):
             read(path)
 
@@ -88,7 +88,7 @@ def test_one_colouring_is_that_of_the_whole_person(scaled):
 
 
 def test_stored_voxels_become_the_payload_they_came_from(scaled):
-    person = read_person(scaled / "person_000001.npz")
+    person = read_payloads(scaled / "person_000001.npz")
     payload = person.payload(0).validate()
     assert torch.allclose(encode_srgb(payload.rgb[7, 1, 2, 3, 4]), person.voxels[0, 7, 2, 3, 4, 1] / 255, atol=1e-5)
     assert payload.density.max().item() == pytest.approx(int(person.voxels[0, ..., 3].max()) / 255 * 100, rel=1e-5)
@@ -116,4 +116,4 @@ def test_delta_scales_of_another_shape_are_rejected(scaled):
     with np.load(scaled / "person_000001.npz") as stored:
         np.savez(scaled / "person.npz", **{**stored, "delta_scale": np.ones((1, K, 4), np.float16)})
     with refused(ValueError, "delta_scale"):
-        read_person(scaled / "person.npz")
+        read_payloads(scaled / "person.npz")

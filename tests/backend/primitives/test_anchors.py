@@ -17,7 +17,6 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.primitives.anchors import (
     CHARTS,
-    JOINT_REGION,
     Anchors,
     anchor_skin_weights,
     attach,
@@ -132,13 +131,6 @@ def test_half_extents_follow_the_spacing_and_the_region():
             0.008, LARGEST_IN_PLANE[region]
         )
         assert torch.allclose(extent[cells, :2], expected)
-
-
-def test_tangent_planes_do_not_depend_on_where_the_body_stands():
-    anchors = ANCHORS.to(dtype=torch.float64)
-    here = tangent_plane(anchors, BODY.template.double())
-    there = tangent_plane(anchors, BODY.template.double() + 100)
-    assert torch.allclose(torch.stack(here), torch.stack(there), atol=2e-5)
 
 
 def test_a_batch_is_its_members():
@@ -352,13 +344,6 @@ def test_a_footprint_is_the_whole_cell_and_agrees_with_the_uv_gradient_on_a_cyli
     by_face = attach(gradient, body.template, body.faces).rotation
     angle = ((by_cell.mT @ by_face).diagonal(dim1=-2, dim2=-1).sum(-1) / 2 - 0.5).clamp(-1, 1).arccos()
     assert float(angle.max()) < math.pi / SEGMENTS + 1e-3
-
-
-def test_charts_come_from_the_joints_that_move_the_skin():
-    body = cylinder()
-    anchors = build_anchors(body)
-    assert (anchors.chart == CHARTS.index(JOINT_REGION[16])).all()
-    assert JOINT_REGION[16] == "left_arm"
 
 
 def test_the_default_bodys_skin_uv_gives_finite_frames_that_point_outward():

@@ -11,7 +11,6 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render import merge as merging
 from primdiffusion.render.merge import Merged, merge
 from primdiffusion.render.reference import trilinear, window
-from support.errors import refused
 
 
 def boxes(count: int = 5, seed: int = 0, spread: float = 0.06) -> Primitives:
@@ -120,9 +119,3 @@ def test_boxes_without_extent_or_content_hold_nothing():
 def test_voxels_that_cannot_be_are_rejected_with_what_to_do(voxel, message):
     with pytest.raises(ValueError, match=message):
         merge(boxes(), voxel)
-
-
-def test_a_batch_is_rejected():
-    primitives = boxes()
-    with refused(ValueError, "human"):
-        merge(Primitives(**{name: value[None] for name, value in vars(primitives).items()}))

@@ -12,9 +12,9 @@ from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.formats.requests import EncodeSettings
-from primdiffusion.people.stored_people import PersonFolder, read_person
+from primdiffusion.people.stored_people import PersonFolder, read_payloads
 from primdiffusion.primitives.primitives import K, S
-from primdiffusion.training.captured_people import encode_people, frames_of_looks, read_cards
+from primdiffusion.training.captured_people import choose_frames, encode_people, read_cards
 from support.errors import refused
 from support.tiny import save_tiny_encoder, tiny_encoder
 
@@ -47,7 +47,7 @@ def outcomes(root, out, settings=AS_ENCODED, cards=None, model=None):
 def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_path, capsys):
     cli.main([*line, "--people", str(root / "people"), "--views", "3"])
     assert capsys.readouterr().out.splitlines() == [f"{FIRST}  done", f"{SECOND}  done  attributes unknown"]
-    stored = read_person(tmp_path / "out" / f"{FIRST}.npz")
+    stored = read_payloads(tmp_path / "out" / f"{FIRST}.npz")
     person = captured_person(root / "captures", FIRST, views=3)
     wanted = load_encoder(root / "tiny.safetensors").encode(person.views, person.betas)
     got = stored.payload(0)
@@ -64,10 +64,10 @@ def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_p
 
 
 def test_looks_are_frames_from_the_first_to_the_last(root, tmp_path):
-    assert frames_of_looks(20, 4) == [0, 5, 10, 15]
-    assert frames_of_looks(2, 9) == [0, 1]
+    assert choose_frames(20, 4) == [0, 5, 10, 15]
+    assert choose_frames(2, 9) == [0, 1]
     outcomes(root, tmp_path, EncodeSettings(looks=2))
-    voxels = read_person(tmp_path / f"{FIRST}.npz").voxels
+    voxels = read_payloads(tmp_path / f"{FIRST}.npz").voxels
     assert len(voxels) == 2
     assert not torch.equal(voxels[0], voxels[1])
 
@@ -76,7 +76,7 @@ def test_refinement_moves_the_payload_towards_the_pictures_and_is_repeatable(roo
     rough, fine = AS_ENCODED, EncodeSettings(refine_steps=2, refine_size=16)
     for name, settings in (("rough", rough), ("fine", fine), ("again", fine)):
         next(encode_people(tiny_encoder(), open_captures(root / "captures"), tmp_path / name, settings))
-    one, two, three = (read_person(tmp_path / name / f"{FIRST}.npz") for name in ("rough", "fine", "again"))
+    one, two, three = (read_payloads(tmp_path / name / f"{FIRST}.npz") for name in ("rough", "fine", "again"))
     assert not torch.equal(one.voxels, two.voxels)
     assert torch.equal(two.voxels, three.voxels)
     assert torch.equal(two.delta_scale, three.delta_scale)

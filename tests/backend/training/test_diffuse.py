@@ -152,16 +152,6 @@ def test_a_new_run_starts_from_a_checkpoints_closed_form_and_weights(people, who
     assert torch.equal(model.denoiser.prior.basis, base.denoiser.prior.basis)
 
 
-def test_more_people_are_learned_from_beside_the_others(people, few, whole, tmp_path):
-    alone = load_checkpoint(whole / MODEL)
-    model = train(settings(people, tmp_path / "more", more_data=few))
-    assert model.card["geometries"] == alone.card["geometries"]
-    assert model.card["blurred_geometries"] == 3
-    assert torch.allclose(alone.codec.codec.basis, model.codec.codec.basis, atol=1e-4)
-    assert not torch.allclose(alone.denoiser.prior.basis, model.denoiser.prior.basis, atol=1e-2)
-    assert "blurred_geometries" not in alone.card
-
-
 def test_a_checkpoint_of_other_slabs_or_densities_is_no_start(people, few, paper, whole, tmp_path):
     with refused(ValueError, "checkpoint"):
         train(settings(people, tmp_path / "run", start_from=paper / MODEL))

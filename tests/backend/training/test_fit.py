@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from fit_scenes import STATE, WHOLE, files, flags, settings, stop_after
+from capture_scenes import save_person
+from fit_scenes import STATE, WHOLE, files, flags, forget_processes, patched_person, settings, stop_after
 from PIL import Image
 from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
+from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
+from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.runtime.worker_process import LOCK
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training.fit import MODEL, EncoderTask, fit, run
@@ -255,3 +259,22 @@ def test_biases_of_places_learn_so_many_times_as_fast_as_weights(captures, tmp_p
 
 def first_task(config: FitConfig) -> EncoderTask:
     return EncoderTask(config, open_captures(config.data), Accelerator(cpu=True))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_default_encoder_overfits_one_person_beyond_32_db(tmp_path):
+    people = {"person_000000": save_person(tmp_path / "person.glb", patched_person())}
+    poses = built_in_poses().map(lambda values: values[:2])
+    job = RenderJob(people, poses, tmp_path / "captures", Rig("sphere", 12, width=256, height=256), ("img", "mask"))
+    assert [outcome.status for outcome in render(job)] == ["done"]
+    forget_processes()
+    torch.manual_seed(0)
+    config = FitConfig(
+        data=job.out, run=tmp_path / "run", steps=150, batch=1,
+        views=8, targets=4, size=192, conditioning_frame="first",
+        learning_rate=1e-3, place_rate=1.0, hold_scale=20, ema=0.9, log_every=10, evaluate_every=25, pictures_every=75,
+    )  # fmt: skip
+    fit(config)
+    psnr = [row["psnr_train"] for row in rows(config.run) if "psnr_train" in row]
+    assert psnr[-1] >= 32, psnr  # 31.1 untrained

@@ -172,7 +172,7 @@ def test_a_polite_kill_asks_to_stop_and_a_second_ctrl_c_stops_at_once(monkeypatc
         os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt.due()
         os.kill(os.getpid(), signal.SIGINT)  # within the two seconds in which launchers pass the same one on
-        monkeypatch.setattr(loop, "IMPATIENT", 0.0)
+        monkeypatch.setattr(loop, "FORCE_QUIT_AFTER_S", 0.0)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGTERM) is before

@@ -11,7 +11,6 @@ from primdiffusion.training.cells import CellTask
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import (
-    BLURRED_FROM,
     blend_conditions,
     blends,
     closed_form,
@@ -22,11 +21,11 @@ from primdiffusion.training.losses import (
 )
 
 
-def latent_set(geometry, detailed):
+def latent_set(geometry):
     """Empty latents of these samples."""
     count, geometries = len(geometry), int(geometry.max()) + 1
     latents, betas, condition = torch.zeros(count, 1, 32, 32), torch.zeros(geometries, 10), torch.zeros(count, 0)
-    return LatentSet(latents, geometry, betas, condition, torch.tensor(detailed))
+    return LatentSet(latents, geometry, betas, condition, torch.tensor(len(geometry)))
 
 
 def test_a_network_that_knows_more_has_less_error(prepared_once):
@@ -63,23 +62,14 @@ def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
 
 def test_blends_stay_within_a_geometry_and_keep_the_variance():
     geometry = torch.tensor([0, 0, 0, 1, 1, 2])
-    people, t = latent_set(geometry, detailed=6), torch.zeros(40_000, dtype=torch.long)
-    weight, place = blends(people, t, 1.0, torch.Generator().manual_seed(0))
+    people = latent_set(geometry)
+    weight, place = blends(people, 40_000, 1.0, torch.Generator().manual_seed(0))
     assert torch.equal(geometry[place[:, 0]], geometry[place[:, 1]])
     assert torch.allclose(weight.sum(1), torch.ones(40_000), atol=1e-6)
     assert weight.square().sum(1).mean().item() == pytest.approx(1.0, abs=0.02)
     assert torch.allclose(torch.bincount(place[:, 0]) / 40_000, torch.full((6,), 1 / 6), atol=0.01)
-    alone, _ = blends(people, t[:100], 0.0, torch.Generator().manual_seed(0))
+    alone, _ = blends(people, 100, 0.0, torch.Generator().manual_seed(0))
     assert torch.equal(alone[:, 1], torch.zeros(100))
-
-
-def test_blurred_people_are_learned_from_where_noise_hides_it():
-    people = latent_set(torch.tensor([0, 0, 1, 2, 2, 3]), detailed=3)
-    t = torch.tensor([BLURRED_FROM, BLURRED_FROM + 1]).repeat_interleave(5_000)
-    _, places = blends(people, t, 0.5, torch.Generator().manual_seed(0))
-    low, high = places.split(5_000)
-    assert set(low.flatten().tolist()) == {0, 1, 2}
-    assert set(high.flatten().tolist()) == {0, 1, 2, 3, 4, 5}
 
 
 def test_mixtures_are_weighted_sums_of_two():
@@ -110,7 +100,7 @@ def test_the_network_learns(prepared_once):
 def test_blends_are_asked_for_by_what_both_people_have():
     condition = torch.tensor([[1.0, 0, 1, 0], [1.0, 0, 0, 1]])
     words = AttributeVocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
-    people = dataclasses.replace(latent_set(torch.zeros(2, dtype=torch.int64), detailed=2), condition=condition)
+    people = dataclasses.replace(latent_set(torch.zeros(2, dtype=torch.int64)), condition=condition)
     indices, weights = torch.tensor([[0, 1], [0, 1]]), torch.tensor([[0.6, 0.4], [1.0, 0.0]])
     asked = [
         blend_conditions(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)

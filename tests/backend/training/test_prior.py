@@ -7,7 +7,9 @@ import dataclasses
 import pytest
 import torch
 from primdiffusion.diffusion.codec import mirror_cells
+from primdiffusion.people.stored_people import find_payloads
 from primdiffusion.primitives.primitives import GRID
+from primdiffusion.training.latents import split_people
 from primdiffusion.training.prior import fit_prior
 
 
@@ -58,28 +60,11 @@ def test_person_components_live_in_the_leading_channels_alone(prepared_once):
     assert (prior.split(prior.join(coefficients, torch.zeros_like(rest)))[0] - coefficients).abs().max() < 1e-3
 
 
-def test_blurred_people_count_for_the_components_but_not_for_the_rest(prepared_once):
-    config, prepared = prepared_once
-    people = prepared.train
-    blurred = dataclasses.replace(people, latents=people.latents.roll(1, 0) * 0.5)
-    both = people.and_blurred(blurred, prepared.codec)
-    assert len(both) == 2 * len(people)
-    assert int(both.detailed) == len(people)
-    assert torch.equal(both.geometry[len(people) :], people.geometry + len(people.betas))
-    alone = fit_prior(people, prepared.codec, prepared.vocabulary, config.prior)
-    prior = fit_prior(both, prepared.codec, prepared.vocabulary, config.prior)
-    assert torch.allclose(prior.mean, alone.mean)
-    z = people.latents.float()
-    left = z - prior.mean - prior.picture(prior.split(z)[0])
-    assert prior.rest_variance.sum() >= left.square().sum((1, 2, 3)).mean() * 0.99
-
-
-def test_blurred_people_get_the_spread_of_detailed_ones(prepared_once):
-    _, prepared = prepared_once
-    people, codec = prepared.train, prepared.codec
-    blurred = dataclasses.replace(people, latents=people.latents.flip(0) * 0.5 + 0.25)
-    both = people.and_blurred(blurred, codec).latents.float()
-    ours, theirs = both[: len(people)], both[len(people) :]
-    pairs = [torch.cat([each, codec.mirror(each)]) for each in (ours, theirs)]
-    assert torch.allclose(pairs[0].mean(0), pairs[1].mean(0), atol=0.02)
-    assert torch.allclose(pairs[0].std(0), pairs[1].std(0), rtol=0.02, atol=0.02)
+def test_held_out_geometries_are_never_trained_on(people):
+    paths = find_payloads(people)
+    train_paths, held = split_people(paths, 0.2, seed=0)
+    assert len(held) == 3
+    assert set(train_paths).isdisjoint(held)
+    assert sorted(train_paths + held) == paths
+    assert split_people(paths, 0.2, seed=0) == (train_paths, held)
+    assert split_people(paths, 0.2, seed=1)[1] != held

@@ -6,9 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
-from primdiffusion.diffusion.gaussian import IMPOSSIBLE
+from primdiffusion.diffusion.gaussian import IMPOSSIBLE, PersonComponents
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.mixture import fit_mixture
 from primdiffusion.training.regression import regress_cells

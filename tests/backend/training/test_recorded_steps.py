@@ -6,8 +6,8 @@ import os
 import pytest
 import torch
 from diffuse_runs import make_small, settings
-from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonComponents
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.training import diffusion_task
 from primdiffusion.training.cells import CellTask

@@ -107,16 +107,6 @@ def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
     assert max(engine.progress, default=0.0) < 1.0
 
 
-def test_an_animation_keeps_its_child(stage, tmp_path):
-    stage.scene.frame_end = 2
-    stage.scene.render.filepath = str(tmp_path / "frame_")
-    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
-    pid = drawing_child.child_pid()
-    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
-    assert len(list(tmp_path.glob("frame_*"))) == 2
-    assert drawing_child.child_pid() == pid
-
-
 def test_a_picture_that_a_defect_interrupted_does_not_block_the_next(stage):
     class Broken(Engine):
         def update_progress(self, fraction: float) -> None:

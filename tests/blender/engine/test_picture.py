@@ -303,17 +303,6 @@ def test_an_orthographic_camera_keeps_the_scale_of_the_person(stage, backend):
     assert np.abs(depth[there] - (far_depth[there] - far + 3.0)).mean() < STEP
 
 
-def test_betas_on_the_armature_change_the_shape(stage, backend):
-    before = render_png(stage.out)
-    stage.armature["primdiffusion_betas"] = [2.0] + [0.0] * 9
-    stage.armature.update_tag()
-    assert np.abs(render_png(stage.out) - before).max() > 50
-    stage.armature["primdiffusion_betas"] = "tall"
-    stage.armature.update_tag()
-    with refused(RuntimeError, "primdiffusion_betas"):
-        render_png(stage.out)
-
-
 @pytest.mark.any_blender
 def test_a_person_scaled_to_nothing_is_not_there_and_nan_is_an_error(stage):
     for scale in ((0, 0, 0), (1, 1, 0)):
@@ -334,15 +323,6 @@ def test_one_percent_and_the_smallest_picture_render(stage, backend):
     render.resolution_percentage = 100
     wanted = eight_bit(expected(stage, backend, size=(4, 4))[0])
     assert np.abs(render_png(stage.out) - wanted).max() <= 1
-
-
-@pytest.mark.any_blender
-def test_a_renamed_collection_and_a_blend_saved_elsewhere_keep_their_person(stage, backend, tmp_path):
-    wanted = eight_bit(expected(stage, backend)[0])
-    stage.person.name = "Renamed"
-    (tmp_path / "elsewhere").mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere" / "other.blend"))
-    assert_same(render_png(stage.out), wanted)
 
 
 @pytest.mark.any_blender

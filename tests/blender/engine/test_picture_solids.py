@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from engine_stage import add_human, cube, material, render_exr, render_png, set_up_render
+from engine_stage import add_human, cube, material, render_png, set_up_render
 from support.errors import refused
 
-from blender_primdiffusion.engine.picture import SceneSolids, base_colour, changed_by, scene_solids, stored
+from blender_primdiffusion.engine.picture import base_colour, changed_by, scene_solids, stored
 from blender_primdiffusion.scene.human import body_of
 
 
@@ -186,14 +186,6 @@ def test_a_cube_inside_a_person_shows_only_where_it_sticks_out(pair):
     assert not (middle[0] > 150 and middle[1] < 60)
 
 
-def test_depth_is_the_nearer_of_person_and_cube(pair):
-    stage, box = pair
-    box.location.y = -0.8
-    _, depth = render_exr(stage.out.with_suffix(".exr"))
-    assert centre_of(box, depth) == pytest.approx(4.0 - 0.8 - 0.1, abs=1e-3)
-    assert depth.max() == np.float32(1e10)
-
-
 @pytest.mark.parametrize("way", ["object", "collection"])
 def test_a_holdout_cuts_a_hole_into_person_and_background(pair, way):
     stage, box = pair
@@ -226,32 +218,3 @@ def test_every_view_shows_the_person_in_its_own_way(pair, view):
     assert np.abs(picture - colour).max() > 50
     if view == "ALPHA":
         assert np.abs(picture[..., 0] - colour[..., 3]).max() <= 1
-
-
-@pytest.mark.any_blender
-def test_an_empty_scene_is_its_background(stage):
-    assert not render_png(stage.out).any()
-    stage.scene.render.film_transparent = False
-    stage.scene.world = None
-    picture = render_png(stage.out)
-    assert not picture[..., :3].any()
-    assert (picture[..., 3] == 255).all()
-
-
-@pytest.mark.any_blender
-def test_links_in_place_of_solids_files_lose_nothing_outside(tmp_path):
-    (tmp_path / "outside").mkdir()
-    mine = tmp_path / "outside" / "mine"
-    mine.write_text("mine")
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    solids = SceneSolids(np.zeros((1, 3, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros(1, bool))
-    path = stored(solids, folder)
-    path.unlink()
-    path.symlink_to(mine.with_name("nothing"))
-    for number in range(12):
-        (folder / f"solids_{number}.npz").symlink_to(mine)
-    assert stored(solids, folder) == path
-    assert list(folder.iterdir()) == [path]
-    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
-    assert mine.read_text() == "mine"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from blender_primdiffusion.engine import viewport
+from blender_primdiffusion.engine.view import renders_volumes, view_engine
 from blender_primdiffusion.engine.viewport import Viewport
 from blender_primdiffusion.scene.build import build_human
 
@@ -107,3 +108,36 @@ def test_a_view_is_refined_to_the_end(marcher, drawn):
     human.location.x = 5.0
     bpy.context.view_layer.update()
     assert not refined(drawn).any()
+
+
+EEVEE = "BLENDER_EEVEE"
+SHADINGS = ("WIREFRAME", "SOLID", "MATERIAL", "RENDERED")
+
+
+def with_volumes(engine: str) -> list[bool]:
+    return [renders_volumes(view_engine(engine, shading)) for shading in SHADINGS]
+
+
+@pytest.mark.any_blender
+def test_views_with_light_leave_humans_to_engines_that_render_their_volumes(addon):
+    for engine in ("CYCLES", EEVEE):
+        assert with_volumes(engine) == [False, False, True, True]
+    assert with_volumes("BLENDER_WORKBENCH") == [False, False, True, False], "Material Preview is EEVEE's"
+    assert with_volumes("PRIMDIFFUSION") == [False, False, True, False]
+
+
+@pytest.mark.any_blender
+def test_the_engine_draws_its_own_view_and_no_other(addon):
+    assert [view_engine("PRIMDIFFUSION", shading) == "PRIMDIFFUSION" for shading in SHADINGS] == [False] * 3 + [True]
+    assert view_engine("PRIMDIFFUSION", "SOLID") == "BLENDER_WORKBENCH"
+
+
+@pytest.mark.any_blender
+def test_an_engine_declares_that_it_renders_volumes_as_blenders_own_do(addon):
+    assert not renders_volumes("SOMEBODYS")
+    engines = bpy.types.DATA_PT_volume_file.COMPAT_ENGINES
+    engines.add("SOMEBODYS")
+    try:
+        assert renders_volumes("SOMEBODYS")
+    finally:
+        engines.discard("SOMEBODYS")

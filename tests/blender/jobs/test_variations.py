@@ -8,14 +8,13 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.files.picture_files import write_png
-from blender_primdiffusion.formats.answers import VariationFiles
 from human_files import person_file
 from jobs_driven import Layout, drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import FAILS, TAKES_LONG, request_of
 
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
+from blender_primdiffusion.jobs.variations import VariationsJob, sheet
 from blender_primdiffusion.jobs.windows import Icons, icons
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import variations_panel
@@ -214,29 +213,6 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
         ops.variations(seed=40)
     assert seeds() == [11, 12, 13, 14]
     assert len(files_left()) == 1
-
-
-def test_none_can_be_redone_with_a_slider():
-    assert not {"REGISTER", "UNDO"} & variations_panel.PRIMDIFFUSION_OT_variations.bl_options
-
-
-def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
-    mine = tmp_path / "outside" / "mine"
-    mine.parent.mkdir()
-    mine.write_text("mine")
-    person = VariationFiles(seed=7, **{name: tmp_path / name for name in ("person", "picture")})
-    for link in (person.person, person.picture):
-        link.symlink_to(mine)
-    own = Sheet()
-    own.fill([person], "")
-    (own.variations[0].folder / "more").symlink_to(mine.parent)
-    folder = own.variations[0].folder.parent
-    own.clear()
-    assert not folder.exists()
-    person.person.write_text("")
-    with refused(OSError, "picture"):
-        own.fill([person], "")
-    assert mine.read_text() == "mine"
 
 
 def painted(path: Path, green: int) -> Path:

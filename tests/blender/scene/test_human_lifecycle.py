@@ -49,20 +49,6 @@ def test_undo_and_redo_across_generate_edit_reshape_and_delete(source, addon):
     assert whole(humans(bpy.context.scene)[0], reshaped)
 
 
-def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(source, addon):
-    step("empty")
-    ops.generate(seed=7)
-    press_x(humans(bpy.context.scene)[0])
-    step("delete")
-    ops.generate(seed=9)
-    assert request_of(person_file(humans(bpy.context.scene)[0]))["seed"] == 9
-    bpy.ops.ed.undo()
-    bpy.ops.ed.undo()
-    person = humans(bpy.context.scene)[0]
-    assert whole(person)
-    assert request_of(person_file(person))["seed"] == 7
-
-
 def test_appended_people_are_whole_and_can_be_edited(person, content, tmp_path):
     where, other = places(person), tmp_path / "other"
     other.mkdir()

@@ -190,15 +190,3 @@ def test_links_in_place_of_merged_files_lose_nothing_outside(tmp_path, outside):
         publish(sources, ["a", "b"], folder)
     assert [path.name for path in mine.parent.iterdir()] == ["mine"]
     assert mine.read_text() == "mine"
-
-
-@pytest.mark.any_blender
-def test_a_link_in_place_of_the_folder_is_what_the_error_is_about(tmp_path):
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "humans").mkdir()
-    (tmp_path / "humans" / "Anna").symlink_to(tmp_path / "outside")
-    (tmp_path / "a.vdb").write_text("a")
-    with pytest.raises(FileError) as caught:
-        publish([tmp_path / "a.vdb"], ["a"], tmp_path / "humans" / "Anna")
-    assert "link" in caught.value.remedy
-    assert list((tmp_path / "outside").iterdir()) == []

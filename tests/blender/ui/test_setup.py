@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import bpy
 import pytest
@@ -128,11 +129,6 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
     assert "wm.path_open" in draw_preferences().of("button")
 
 
-def test_nothing_to_cancel_is_rejected(wheels):
-    with refused(RuntimeError, "nothing"):
-        press.cancel(what="SET_UP")
-
-
 def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, tmp_path, monkeypatch):
     with served(online, stalls="torch") as (index, handler):
         own_index(monkeypatch, index)
@@ -147,17 +143,6 @@ def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, 
     assert not session.busy
     assert session.notice.startswith("Cancelled")
     assert known().state == "broken"
-
-
-def test_an_existing_python_goes_first(wheels, monkeypatch):
-    monkeypatch.setenv(VARIABLE, "/no/such/python")
-    assert known().line == f"Uses /no/such/python, named by the environment variable {VARIABLE}"
-
-
-def test_a_named_python_has_no_tick(wheels, monkeypatch):
-    monkeypatch.setenv(VARIABLE, "/some/python")
-    assert known().usable
-    assert preferences._icon(known()) not in ("CHECKMARK", "ERROR")
 
 
 def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypatch):
@@ -199,3 +184,27 @@ def test_the_zip_holds_the_locks_and_asks_for_the_network():
     manifest = (build_addon.ADDON / "blender_manifest.toml").read_text()
     reason = re.search(r'^network = "(.+)"$', manifest, re.MULTILINE)
     assert len(reason[1]) <= 64
+
+
+@pytest.fixture
+def alone(addon, monkeypatch):
+    """The viewer, and no backend anywhere."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr(preferences, "setup", None)
+    monkeypatch.setattr(preferences, "own_python_has_backend", lambda **_: False)
+    monkeypatch.setattr(preferences, "installed_backend", lambda: None)
+
+
+def test_without_a_backend_the_panel_says_what_to_do_and_opens_the_preferences(alone):
+    layout = MagicMock()
+    assert not preferences.draw_set_up(layout)
+    assert layout.box().operator.call_args.args == ("preferences.addon_show",)
+    assert preferences.known().line.startswith("There is no backend on this computer: install")
+
+
+def test_a_program_on_the_path_is_found_and_one_in_the_preferences_goes_first(alone, monkeypatch):
+    monkeypatch.setattr(preferences, "installed_backend", lambda: Path("/opt/primdiffusion"))
+    assert preferences.draw_set_up(MagicMock())
+    assert preferences.known().line == "Uses /opt/primdiffusion, named by the PATH"
+    monkeypatch.setattr(preferences, "preference", lambda _name: "/mine/bin/python")
+    assert preferences.known().line == "Uses /mine/bin/python, named by the extension's preferences"

@@ -23,7 +23,7 @@ from ...files.arrays import array_names, read_arrays, read_npy
 from ...files.json_files import read_json
 from ...files.regular_files import FileError, read_regular
 from ...files.smpl_pickle import Inert, as_array, load_restricted
-from ...files.whole_files import replacing
+from ...files.whole_files import atomic_replace
 from .bvh import read_bvh
 from .motion import (
     DEFAULT_FPS,
@@ -311,7 +311,7 @@ def write_amass(path: Path, motion: Motion, betas: NDArray, pelvis: NDArray = RE
     places = (motion.translations + pelvis) @ up.T - pelvis
     try:
         os.stat(path.parent)  # a folder that is missing is a slip of the finger: `replacing` would make it
-        with replacing(path) as partial, partial.open("wb") as stream:
+        with atomic_replace(path) as partial, partial.open("wb") as stream:
             np.savez(
                 stream,
                 poses=to_axis_angle(turned).reshape(len(turned), -1),

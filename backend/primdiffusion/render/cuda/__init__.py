@@ -15,7 +15,7 @@ def available(device: torch.device | str = "cuda") -> bool:
     return torch.device(device).type == "cuda" and importlib.util.find_spec("triton") is not None
 
 
-def suits(primitives: Primitives, camera: Camera) -> bool:
+def supports(primitives: Primitives, camera: Camera) -> bool:
     """Whether `march_cuda` supports the scene: float32, voxels of 8^3."""
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
     single = all(tensor.dtype == torch.float32 for tensor in tensors)

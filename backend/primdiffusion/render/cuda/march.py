@@ -20,7 +20,7 @@ from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
 from primdiffusion.render.cuda import triton_adjoint
 from primdiffusion.render.cuda.marcher import prepared
-from primdiffusion.render.cuda.scene import BOX_FIELDS, Packed, Picture, Scene, Shapes, check, launch
+from primdiffusion.render.cuda.scene import BOX_FIELDS, MarchScene, Packed, Picture, Shapes, check, launch
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
@@ -56,14 +56,14 @@ def march_cuda(
         repeats = cuda_graph.usable(device) and not cuda_graph.recording() and span is None and not keep
         if repeats and primitives.position.shape[1] and (marcher := prepared(primitives, settings, shapes)):
             return marcher(camera)
-        return Rendering(*_March.apply(Scene(primitives, camera, settings, span, shapes, keep), *tensors))
+        return Rendering(*_March.apply(MarchScene(primitives, camera, settings, span, shapes, keep), *tensors))
 
 
 class _March(torch.autograd.Function):
     """Forward pass and adjoint (SPEC 4). The gradient of a sample depends on it and a few numbers of its ray."""
 
     @staticmethod
-    def forward(ctx: Any, scene: Scene, *tensors: Tensor) -> Picture:
+    def forward(ctx: Any, scene: MarchScene, *tensors: Tensor) -> Picture:
         *geometry, rgb, density, intrinsics, world_to_camera = [tensor.detach().contiguous() for tensor in tensors]
         (p, k), (b, height, width) = rgb.shape[:2], (len(intrinsics), scene.camera.height, scene.camera.width)
         if k == 0:

@@ -11,7 +11,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
-from primdiffusion.render.cuda.scene import Packed, Picture, Placed, Plan, Scene, Shapes
+from primdiffusion.render.cuda.scene import MarchScene, Packed, Picture, PlacedBoxes, Plan, Shapes
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings
 
@@ -92,7 +92,7 @@ class _Size:
             self._planes = torch.empty(6, -(-rays // 4) * 4, device=device)
         self._flat = (views, height, width)
         self._picture = self._views(self._planes)
-        self._place: tuple[torch.cuda.CUDAGraph, Placed] | None = None
+        self._place: tuple[torch.cuda.CUDAGraph, PlacedBoxes] | None = None
         self._draws: dict[Plan, torch.cuda.CUDAGraph | None] = {}
         """None for plans by which a picture was launched from Python: that compiles what is recorded next."""
 
@@ -108,9 +108,9 @@ class _Size:
         marcher, record = self._marcher, cuda_graph.usable(self._marcher.device)
         inputs = [camera.intrinsics, camera.world_to_camera]
         cuda_graph.copy_all([self._camera.intrinsics, self._camera.world_to_camera], inputs)
-        scene = Scene(marcher.primitives, self._camera, marcher.settings, None, marcher.shapes, keep=False)
+        scene = MarchScene(marcher.primitives, self._camera, marcher.settings, None, marcher.shapes, keep=False)
 
-        def place() -> Placed:
+        def place() -> PlacedBoxes:
             own = (self._camera.intrinsics, self._camera.world_to_camera)
             return cuda_scene.place(scene, marcher.packed, marcher.geometry, *own)
 

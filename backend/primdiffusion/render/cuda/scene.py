@@ -72,7 +72,7 @@ class Shapes:
         return self.blocks_of_unit * max(pixels, 512 * 512) // (512 * 512)
 
 
-class Scene(NamedTuple):
+class MarchScene(NamedTuple):
     """Arguments of the marcher that are not differentiable."""
 
     primitives: Primitives
@@ -168,7 +168,7 @@ class Packed(NamedTuple):
         return self
 
 
-class Placed(NamedTuple):
+class PlacedBoxes(NamedTuple):
     """Boxes as the views see them (see `triton_boxes`)."""
 
     record: Float[Tensor, "b k 32"]
@@ -234,7 +234,9 @@ def _lattice(spacing: float, thresholds: tuple[float, ...], device: torch.device
     return torch.tensor([spacing, *thresholds], dtype=torch.float64, device=device)
 
 
-def place(scene: Scene, packed: Packed, geometry: list[Tensor], intrinsics: Tensor, world_to_camera: Tensor) -> Placed:
+def place(
+    scene: MarchScene, packed: Packed, geometry: list[Tensor], intrinsics: Tensor, world_to_camera: Tensor
+) -> PlacedBoxes:
     """Place the boxes, whose position, rotation and half extent are `geometry`, as each view sees them."""
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     (p, k), b, device = geometry[0].shape[:2], len(intrinsics), intrinsics.device
@@ -261,10 +263,10 @@ def place(scene: Scene, packed: Packed, geometry: list[Tensor], intrinsics: Tens
         totals[4] += sum(torch.isnan(limit).sum() for limit in limits)
         first, last = (limit.double() / scene.spacing for limit in limits)
         reach = torch.stack([first.ceil().clamp(1, LAST_POINT), last.floor().clamp(0, LAST_POINT)], dim=-1).int()
-    return Placed(record, indices, order, reach, totals)
+    return PlacedBoxes(record, indices, order, reach, totals)
 
 
-def drawn(scene: Scene, placed: Placed, draw: Callable[[Plan], Drawing]) -> tuple[Drawing, int]:
+def drawn(scene: MarchScene, placed: PlacedBoxes, draw: Callable[[Plan], Drawing]) -> tuple[Drawing, int]:
     """Draw by the plan of the last such scene, again if it does not fit; also the programs of the backward pass.
 
     The host waits for the totals while the picture is being drawn. In a recording it cannot: then each repetition
@@ -299,7 +301,7 @@ def march_constants(shapes: Shapes, sets: int, gap: int) -> dict[str, int]:
     return {"TILE_WIDTH": shapes.tile[0], "TILE_HEIGHT": shapes.tile[1], "COARSE": coarse, "SETS": sets, "GAP": gap}
 
 
-def draw(scene: Scene, packed: Packed, placed: Placed, picture: Picture, plan: Plan) -> Kept:
+def draw(scene: MarchScene, packed: Packed, placed: PlacedBoxes, picture: Picture, plan: Plan) -> Kept:
     """List the boxes by tile and march; writes `picture`."""
     shapes, (b, height, width), device = scene.shapes, picture[1].shape, picture[1].device
     (p, k), keep = packed.bounds.shape[:2], scene.keep or scene.index_order
@@ -327,7 +329,7 @@ def draw(scene: Scene, packed: Packed, placed: Placed, picture: Picture, plan: P
     return Kept(kept, ends)
 
 
-def _list(scene: Scene, plan: Plan, placed: Placed, order: Int[Tensor, "b k"]) -> _Lists:
+def _list(scene: MarchScene, plan: Plan, placed: PlacedBoxes, order: Int[Tensor, "b k"]) -> _Lists:
     """List the boxes of each tile, or bin, in `order`; a list may be cut short where the plan does not fit."""
     (b, k), device = order.shape, order.device
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height

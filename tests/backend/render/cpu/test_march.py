@@ -13,7 +13,6 @@ from primdiffusion.render.cpu.march import _scene, _view, count_samples, march_c
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
-from support.errors import refused
 
 FACE_STEP = 3.4e-4
 """The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
@@ -88,28 +87,6 @@ def test_boxes_without_extent_draw_nothing_and_disturb_nothing():
     kept = boxes.map(lambda tensor: tensor[[0, 2, 3, 4, 6, 7]])
     for render in (march_cpu, march_reference):
         assert torch.equal(render(flat, camera).rgb, render(kept, camera).rgb)
-
-
-@pytest.mark.parametrize("render", [march_cpu, march_reference])
-def test_a_batch_is_rejected(render):
-    boxes, camera = random_boxes(2).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
-    with refused(ValueError, "batch"):
-        render(boxes.map(lambda tensor: tensor[None]), camera)
-
-
-@pytest.mark.parametrize("render", [march_cpu, march_reference, march])
-@pytest.mark.parametrize("name", ["position", "rotation", "half_extent", "rgb", "density"])
-def test_nan_is_rejected_by_name(render, name):
-    boxes, camera = random_boxes(2).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
-    getattr(boxes, name).view(-1)[-1] = torch.nan
-    with refused(ValueError, f"primitives.{name}", "NaN"):
-        render(boxes, camera)
-
-
-def test_the_fast_marcher_repeats_itself_bit_for_bit():
-    boxes, camera = random_boxes(40, 17).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5), width=64, height=64)
-    first, second = (march_cpu(boxes, camera.to(dtype=torch.float32)) for _ in range(2))
-    assert torch.equal(first.rgb, second.rgb)
 
 
 def test_march_takes_the_reference_for_float64_and_the_fast_one_for_float32_with_gradients_or_without():

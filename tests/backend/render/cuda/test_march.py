@@ -98,6 +98,6 @@ def test_the_small_kernels_compile_without_spilling(tmp_path):
 
 def test_suits_what_it_can_draw():
     boxes, camera = random_boxes(1).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
-    assert cuda.suits(boxes, camera)
-    assert not cuda.suits(boxes, camera.to(dtype=torch.float64))
-    assert not cuda.suits(random_boxes(1, size=4).to(dtype=torch.float32), camera)
+    assert cuda.supports(boxes, camera)
+    assert not cuda.supports(boxes, camera.to(dtype=torch.float64))
+    assert not cuda.supports(random_boxes(1, size=4).to(dtype=torch.float32), camera)
