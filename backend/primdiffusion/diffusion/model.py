@@ -169,6 +169,22 @@ class DiffusionModel:
         cells = self.surfaces.recolour(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
         return payload_from_cells(cells, self.full_density, codec.zone)
 
+    def plain_after_all(self, x0: Float[Tensor, "1 c h w"]) -> bool:
+        """Whether the prior takes a person for patterned whose garments have one colour each, but for small prints.
+
+        It does so with clothes that are unlike those of the training set: patterned people differ more there.
+        """
+        prior, words = getattr(self.denoiser, "prior", None), self.vocabulary.categories.get("pattern", ())
+        if self.surfaces is None or not isinstance(prior, PersonPrior) or "plain" not in words:
+            return False
+        assert isinstance(self.codec, CellCodec)
+        plain, block = self.vocabulary.encode({"pattern": "plain"}).to(x0), self.vocabulary.blocks()["pattern"]
+        kind = prior.expected_kind(prior.split(x0)[0])[0].to(x0)
+        if kind @ plain > 0.5:
+            return False
+        kind[block] = plain[block]
+        return self.surfaces.even(self.codec.codec.decode(x0)[0], kind, plain)
+
     def encode(self, payload: Payload) -> Float[Tensor, "*b c h w"]:
         """The clean samples nearest to payloads, on the model's device."""
         return self.codec.from_payload(payload.to(self.device), self.full_density)

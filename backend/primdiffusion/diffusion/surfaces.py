@@ -28,6 +28,8 @@ BRIGHTEST = 2.0
 """Largest tone."""
 DIMMEST = 0.3
 """Darker voxels say little of a garment's colours."""
+EVEN, MOST_BOXES = 0.04, 0.75
+"""Difference from the garment's colour that so many of its boxes stay below, on plain people."""
 EXPLAINED = 0.5
 """Share of the variance of a garment's colours that its prints explain together, or it has another one."""
 
@@ -118,17 +120,35 @@ class Surfaces(TensorRecord):
         second[self.box[own]] = self.second[own]
         return second
 
+    def even(self, cells: Float[Tensor, "k v"], kind: Float[Tensor, "a"], plain: Float[Tensor, "a"]) -> bool:
+        """Whether the garments that are `plain` on a person of this kind have one colour each; False without any."""
+        garments = _fitting(kind[None], self.condition)[0] & (self.condition @ plain > 0.5)
+        whole = garments[self.surface] & self.read & self.drawn
+        bare = torch.ones_like(cells[:, : S**3])
+        boxes = [
+            self._colours_of_boxes(cells, whole & (self.surface == garment), bare)
+            for garment in self.surface[whole].unique().tolist()
+        ]
+        differences = [(each - each.median(0).values).abs().mean(1) for each in boxes]
+        return bool(boxes) and all(float(each.quantile(MOST_BOXES)) < EVEN for each in differences)
+
     def _colour(
         self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"], bare: Float[Tensor, "k 512"]
     ) -> Float[Tensor, "3"]:
         """The median colour of a person's boxes, of voxels that no later surface covers."""
+        return self._colours_of_boxes(cells, rows, bare).median(0).values
+
+    def _colours_of_boxes(
+        self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"], bare: Float[Tensor, "k 512"]
+    ) -> Float[Tensor, "r 3"]:
+        """The surface's colour by each of its boxes that are mostly bare; the mean of all if there are none."""
         voxels = voxels_of(cells[self.cell[rows]])
         whole = (self.share[rows] - SURELY).clamp_min(0) * seen(voxels)
         weight = whole * bare[self.cell[rows]]
         tone = (self.tone[rows] * weight).sum(1, keepdim=True)
         of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / tone.clamp_min(1e-6)
         sure = weight.sum(1) > whole.sum(1) / 2
-        return of_boxes[sure].median(0).values if sure.any() else of_boxes.mean(0)
+        return of_boxes[sure] if sure.any() else of_boxes.mean(0, keepdim=True)
 
 
 def _fitting(kind: Float[Tensor, "b x"], condition: Float[Tensor, "n x"]) -> Bool[Tensor, "b n"]:

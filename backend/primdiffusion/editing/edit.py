@@ -67,6 +67,15 @@ def edit_generator(seed: int) -> torch.Generator:
     return seeded(seed ^ EDIT_SEED_MASK)
 
 
+def kept_attributes(
+    model: DiffusionModel, human: Human, x0: Float[Tensor, "1 c h w"], asked: Mapping[str, str | float]
+) -> Mapping[str, str | float]:
+    """What an edit is conditioned on: what was asked for, and plain clothes of pictures that the prior mistakes."""
+    from_pictures = "reconstructed_from" in human.provenance
+    plain = from_pictures and "pattern" not in asked and model.plain_after_all(x0)
+    return {**asked, "pattern": "plain"} if plain else asked
+
+
 def conditional_denoiser(model: DiffusionModel, attributes: Mapping[str, str | float], guidance: float) -> Denoise:
     """Return the model's denoiser, conditioned on attributes. Raises ValueError for unknown ones."""
     if not math.isfinite(guidance):

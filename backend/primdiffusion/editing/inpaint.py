@@ -25,6 +25,7 @@ from primdiffusion.editing.edit import (
     edit_generator,
     edit_timesteps,
     encoded,
+    kept_attributes,
     match_density,
     run_sampler,
     with_edit,
@@ -202,7 +203,8 @@ def harmonise(
     if chain:
         known, inside = encoded(model, human), model.cell_mask(region)
         start = noised(model.schedule, known, chain[0], generator)
-        x0 = run_sampler(repaint(model.denoise, model.schedule, start, known, inside, chain, generator), on_step)
+        denoise = conditional_denoiser(model, kept_attributes(model, human, known, {}), guidance=1.0)
+        x0 = run_sampler(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
         payload = combined(region, decoded(model, x0), human.payload)
     edit = {
         "edit": "harmonise",

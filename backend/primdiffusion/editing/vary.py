@@ -18,6 +18,7 @@ from primdiffusion.editing.edit import (
     edit_generator,
     edit_timesteps,
     encoded,
+    kept_attributes,
     match_density,
     run_sampler,
     with_edit,
@@ -68,11 +69,12 @@ def vary_batch(
     """Return variants for several seeds, sampled as one batch; equal to `vary` up to rounding. Raises as `vary`."""
     generators = [edit_generator(seed) for seed in seeds]
     model = match_density(model, human)
-    denoise = conditional_denoiser(model, attributes, guidance)
+    conditional_denoiser(model, attributes, guidance)  # what it refuses is an error for any amount
     chain = edit_timesteps(model, amount, steps)
     payloads, missed = [human.payload.to("cpu")] * len(seeds), [{}] * len(seeds)
     if chain:
         x0 = encoded(model, human)
+        denoise = conditional_denoiser(model, kept_attributes(model, human, x0, attributes), guidance)
         residual = difference(payloads[0], decoded(model, x0))
         clean = x0.expand(len(seeds), *x0.shape[1:])
         level = torch.full((len(seeds),), chain[0], device=x0.device)

@@ -283,6 +283,16 @@ def test_a_mixture_of_prints_becomes_the_nearest_one(surfaces, pattern, hair):
     torch.testing.assert_close(after.mean(0), before.mean(0), atol=0.02, rtol=0)
 
 
+@pytest.mark.parametrize(("pattern", "even"), [("", True), *((pattern, False) for pattern in PRINTS)])
+def test_plain_clothes_are_told_from_patterned_ones(surfaces, pattern, even):
+    generator = torch.Generator().manual_seed(5)
+    cells = dressed("bald", some_colours(generator), generator, pattern)
+    cells = cells + 0.02 * torch.randn(cells.shape, generator=generator)
+    kind = WORDS.encode({"outfit": "tee", "pattern": "plain", "hair": "long", "hat": "none"})
+    assert surfaces.even(cells, kind, WORDS.encode({"pattern": "plain"})) == even
+    assert not surfaces.even(cells, WORDS.encode({"outfit": "jumper", "pattern": "plain"}), kind)  # no garments known
+
+
 def test_few_people_or_unknown_ones_have_no_surfaces(people, codec):
     few = people.geometry % GEOMETRIES == 1  # three geometries
     some = dataclasses.replace(

@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 from diffusion_people import small_model
-from primdiffusion.diffusion.model import seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.schedule import dense_steps, early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
 from primdiffusion.editing.inpaint import harmonise, inpaint
@@ -165,6 +165,21 @@ def test_what_the_model_does_not_know_cannot_be_asked_for(human, edit):
         EDITS[edit](tiny_model(), human, attributes={"species": "cat"})
     with refused(ValueError, "guidance"):
         EDITS[edit](tiny_model(), human, guidance=float("nan"))
+
+
+@pytest.mark.parametrize("edit", ["vary", "harmonise"])
+def test_plain_clothes_that_the_prior_takes_for_patterned_stay_plain(human, edit, monkeypatch):
+    model, asked = small_model(), []
+    from_picture = dataclasses.replace(human, provenance={**human.provenance, "reconstructed_from": "anna"})
+    monkeypatch.setattr(DiffusionModel, "condition", lambda self, attributes: asked.append(dict(attributes)))
+    for plain in (False, True):
+        monkeypatch.setattr(DiffusionModel, "plain_after_all", lambda *_, plain=plain: plain)
+        EDITS[edit](model, from_picture)
+        assert asked[-1] == ({"pattern": "plain"} if plain else {})
+    EDITS[edit](model, human)
+    assert asked[-1] == {}
+    vary(model, from_picture, 0.6, steps=2, attributes={"pattern": "patterned"})
+    assert asked[-1] == {"pattern": "patterned"}
 
 
 def test_attributes_steer_what_a_region_becomes(human):
