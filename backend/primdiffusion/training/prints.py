@@ -14,7 +14,7 @@ from torch import Tensor
 
 from primdiffusion.primitives.primitives import S
 
-ALIKE = 0.55
+ALIKE = 0.65
 """Least cosine of the patterns of two people who have the same print."""
 STRONG = 0.04
 """Least rms difference from a garment's mean colour: less is light and folds."""
