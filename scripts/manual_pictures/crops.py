@@ -47,7 +47,7 @@ _ABOVE, BELOW = 24, {"window 0": 84, "view": 0}
 properties and the timeline are left out too."""
 PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
-ROW_PART = (320, 200, 990, 1100)
+ROW_PART = (320, 178, 990, 1078)
 """Pixels of the main window in ROWS."""
 _STACKED_ROWS = 130
 """Pixels of the preferences' part: down to the end of the backend's box while a set-up runs."""
