@@ -19,7 +19,7 @@ from primdiffusion.human import Human, generate, render
 from .shrink import save_jpeg
 
 SEED = 10
-HEIGHT_M, WEIGHT_KG = 1.74, 112.0
+HEIGHT_M, WEIGHT_KG = 1.70, 95.0
 SIZE = 420
 _GREY = (0.35, 0.35, 0.35)
 
