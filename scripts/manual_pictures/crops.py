@@ -43,8 +43,8 @@ ROWS = {"window_picture": ("picture_posed", "picture_fitted", "picture_posed_mad
 """Camera's frame of the main window, side by side."""
 DIALOGS = {"motion_dialog": "motion_dialog"}
 _ABOVE, BELOW = 24, {"window 0": 84, "view": 0}
-"""Pixels of the main window that are left out above the 3D view and at its lower edge; "view" has the asset shelf. The
-properties and the timeline are left out too."""
+"""Pixels of the main window that are left out above the 3D view and at its lower edge; "view" has the asset shelf,
+below the sidebar. The properties and the timeline are left out too."""
 PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
 ROW_PART = (320, 178, 990, 1078)
@@ -69,7 +69,7 @@ def crop_all(shots: Path, out: Path) -> None:
         if _are_there(shots, shot):
             picture, boxes = _read(shots, shot)
             if window in BELOW:
-                _, _, right, bottom = boxes["sidebar"]
+                _, _, right, bottom = boxes["view"]
                 part = picture.crop((0, _ABOVE, right, bottom - BELOW[window]))
                 part.thumbnail((_WINDOW_WIDTH, part.height), Image.Resampling.LANCZOS)
                 save_jpeg(part, out / f"{name}.jpg")

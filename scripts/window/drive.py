@@ -81,7 +81,7 @@ def photograph(name: str) -> Iterator[float]:
 
 
 def where() -> dict[str, list[int]]:
-    """Left, top, right, bottom in pixels of the screen: the sidebar, and each window."""
+    """Left, top, right, bottom in pixels of the screen: each window, the 3D view, and its sidebar without the shelf."""
     boxes = {}
     windows = bpy.context.window_manager.windows
     full = windows[0].height
@@ -89,10 +89,11 @@ def where() -> dict[str, list[int]]:
         top = full - window.y - window.height
         boxes[f"window {number}"] = [window.x, top, window.x + window.width, top + window.height]
     for area in windows[0].screen.areas:
-        for region in area.regions:
-            if area.type == "VIEW_3D" and region.type == "UI":
-                top = full - region.y - region.height
-                boxes["sidebar"] = [region.x, top, region.x + region.width, top + region.height]
+        if area.type == "VIEW_3D":
+            region = next(region for region in area.regions if region.type == "UI")
+            for name, part in (("view", area), ("sidebar", region)):
+                top = full - part.y - part.height
+                boxes[name] = [part.x, top, part.x + part.width, top + part.height]
     return boxes
 
 
