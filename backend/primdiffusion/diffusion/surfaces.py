@@ -106,7 +106,7 @@ class Surfaces(TensorRecord):
         centred = second - (second @ weight)[:, None]
         gram, by_colour = (centred * weight) @ centred.T, (centred * weight) @ untoned
         together = torch.linalg.solve(gram + 1e-4 * torch.eye(len(gram)).to(gram), by_colour)
-        if (together * by_colour).sum() < EXPLAINED * variance:
+        if (together * by_colour).sum() <= EXPLAINED * variance:
             return voxels[..., :3]
         best = together.square().sum(1).argmax()
         slope = by_colour[best] / gram[best, best].clamp_min(1e-6)

@@ -67,7 +67,7 @@ FRONT = 30.0
 """Logarithm of how much more probable a picture from the front is than one from behind: most people show their face,
 and colours tell less before the pose is found exactly."""
 OWN_COLOURS = Stage(20, 0.03, upright=False)
-"""Before turns are told by colours, with those of each: limbs that are elsewhere would count more than a face."""
+"""Before colours decide on turns, with those of each: limbs that are elsewhere would count more than a face."""
 TURN_STEPS = 3
 """Gauss-Newton steps on coefficients whose evidence tells the turns that are left: a face from hair."""
 OUTLINE_IN_PICTURE = 256

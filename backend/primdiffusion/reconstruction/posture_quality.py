@@ -42,7 +42,7 @@ LIMITS: Mapping[str, float] = {
     "head": 0.06,
     "joint": 1.0,
 }
-"""Values that fits of whole people in good masks stay below (`benchmarks/plain_pictures.py --spoiled`)."""
+"""Values that fits of whole people in good masks stay below (`benchmarks/plain_pictures.py spoiled`)."""
 COLOUR_STEPS = 2
 """Gauss-Newton steps to the person coefficients that draw the colours."""
 EDGE_PX = 1

@@ -239,8 +239,10 @@ def test_people_without_known_surfaces_stay_as_they_are(surfaces, known):
     assert torch.equal(surfaces.recolour(cells, WORDS.encode({"outfit": "jumper", **known})[None]), cells)
 
 
-def test_patterned_garments_keep_their_pattern(surfaces):
+@pytest.mark.parametrize("density", [1.0, 0.0])
+def test_patterned_garments_keep_their_pattern(surfaces, density):
     cells = torch.rand(1, K, VALUES)
+    cells[..., 3 * S**3 : 4 * S**3] = density
     kind = WORDS.encode({"outfit": "tee", "pattern": "patterned", "hair": "bald", "hat": "none"})
     top = region_of(("torso",))
     assert torch.equal(surfaces.recolour(cells, kind[None])[:, top], cells[:, top])
