@@ -286,8 +286,7 @@ def _explained(
 ) -> list[int]:
     """Numbers of the turns that explain the pictures best, one for each; `alone`: how badly each does for itself.
 
-    Pictures are decided one after the other, the clearest first; each has to show the same person as those before. The
-    first is tried in each of its turns: with it in the wrong one all would be.
+    Pictures are decided one after the other, the clearest first; each has to show the same person as those before.
     """
     turns = [[one for one, own in enumerate(pictures) if own == picture] for picture in sorted(set(pictures))]
 
@@ -295,18 +294,14 @@ def _explained(
         best, *others = sorted(alone[one] for one in numbers)
         return best - others[0] if others else -math.inf
 
-    first, *others = sorted(turns, key=doubt)
-
-    def decided(kept: list[int]) -> tuple[float, list[int]]:
-        error = alone[kept[0]]
-        for numbers in others:
+    kept: list[int] = []
+    for numbers in sorted(turns, key=doubt):
+        errors = dict(enumerate(alone))
+        if kept and len(numbers) > 1:
             before = [targets[one] for one in kept]
             errors = {one: -_person_in(components, [*before, targets[one]]).evidence for one in numbers}
-            kept = [*kept, min(numbers, key=errors.__getitem__)]
-            error = errors[kept[-1]]
-        return error, sorted(kept)
-
-    return min(decided([one]) for one in first)[1]
+        kept.append(min(numbers, key=errors.__getitem__))
+    return sorted(kept)
 
 
 def _person_in(components: PriorFit, targets: Sequence[PosedView]) -> Explanation:
