@@ -103,16 +103,14 @@ def read_models(folder: Path, without_default: bool = False) -> dict[str, Model]
     voxels = load_voxel_model(folder / "voxels" / "voxel.safetensors")
 
     models = {
-        "ours": Model(ours.card, lambda seeds, views: images_of(generated(ours, seeds), seeds, views)),
-        "latents": Model(
-            latents.card, lambda seeds, views: images_of(iter(sample_people(latents, seeds)), seeds, views)
-        ),
+        "ours": Model(ours.card, lambda seeds, views: images_of(generated(ours, seeds), views)),
+        "latents": Model(latents.card, lambda seeds, views: images_of(iter(sample_people(latents, seeds)), views)),
         "voxels": Model(voxels.card, lambda seeds, views: voxel_images(voxels, seeds, views)),
     }
     check_equal({name: model.card for name, model in models.items()})
     if not without_default:
         default = load_checkpoint()
-        models["default"] = Model(default.card, lambda seeds, views: images_of(generated(default, seeds), seeds, views))
+        models["default"] = Model(default.card, lambda seeds, views: images_of(generated(default, seeds), views))
     return models
 
 
@@ -125,17 +123,17 @@ def check_equal(cards: Mapping[str, Mapping[str, Any]]) -> None:
         raise ValueError(f"the models were not trained equally ({trained}): train them again")
 
 
-def images_of(humans: Iterator[Human], seeds: Sequence[int], views: int) -> Iterator[TestImage]:
-    """Pictures of humans of these seeds."""
-    for seed, human in zip(seeds, humans, strict=True):
-        yield from human_images(human, REST, views, f"{seed:06d}", MARCH, torch.device("cpu"))
+def images_of(humans: Iterator[Human], views: int) -> Iterator[TestImage]:
+    """Pictures of humans."""
+    for human in humans:
+        yield from human_images(human, REST, views, MARCH, torch.device("cpu"))
 
 
 def voxel_images(model: VoxelModel, seeds: Sequence[int], views: int) -> Iterator[TestImage]:
     """Pictures of grids around the bodies that were sampled with them."""
-    for seed, person in zip(seeds, model.sample(seeds), strict=True):
+    for person in model.sample(seeds):
         posed = pose_body(person.betas, REST.map(lambda t: t[0]))
-        yield from primitive_images(model.primitives(person.grid), posed, views, f"{seed:06d}", MARCH)
+        yield from primitive_images(model.primitives(person.grid), posed, views, MARCH)
 
 
 def judged_rows(

@@ -92,15 +92,14 @@ def training_images(
         generator = torch.Generator().manual_seed(seed)
         poses = random_poses(pictures_each, generator)
         yaws = (2 * np.pi * torch.rand(pictures_each, 1, generator=generator)).tolist()
-        for image in mesh_images(person, poses, yaws, str(seed), 2 * INPUT):
+        for image in mesh_images(person, poses, yaws, 2 * INPUT):
             assert image.joints is not None
             assert image.head_size is not None
-            assert image.depth is not None
-            side = image.rgb.shape[0]
+            side = len(image.image.rgb)
             pictures.append(shrunk(image.pixels))
             joints.append(image.joints / side)
             sizes.append(image.head_size / side)
-            depths.append(cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask))
+            depths.append(cell_means(1 / image.depth, image.mask))
             attributes.append(person.attributes)
         report(number + 1, len(seeds))
     return TrainingImages(

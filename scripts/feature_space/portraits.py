@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt8
-from primdiffusion.evaluation.images import image_over
+from jaxtyping import Float, Int, UInt8
 from primdiffusion.files.arrays import read_arrays
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -70,17 +70,18 @@ def camera_of(portrait: Portrait, side: int = SIDE) -> Camera:
 def portraits(primitives: Primitives) -> UInt8[Tensor, "v h w 4"]:
     """All views drawn by the marcher: sRGB-encoded colour over black, and alpha."""
     seen = [march(primitives, camera_of(portrait), SETTINGS) for portrait in PORTRAITS]
-    return torch.stack([image_over(0, "", one.rgb, one.alpha, 0, view).rgba for view, one in enumerate(seen)])
+    return torch.stack([_stored(one.rgb, one.alpha) for one in seen])
 
 
 def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w 4"]:
     """Portraits of meshes in T pose that differ only in their textures, as `portraits` of boxes."""
     seen = rasterise_colourings(colourings, [camera_of(portrait) for portrait in PORTRAITS], SUPERSAMPLE)
-    views = [
-        [image_over(0, "", torch.from_numpy(one.rgb), torch.from_numpy(one.alpha), 0, view).rgba for one in images]
-        for view, images in enumerate(seen)
-    ]
+    views = [[_stored(torch.from_numpy(one.rgb), torch.from_numpy(one.alpha)) for one in images] for images in seen]
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
+
+
+def _stored(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w 4"]:
+    return to_bytes(torch.cat([encode_srgb(rgb.clamp(0, 1)), alpha[..., None]], -1))
 
 
 Report = Callable[[int, int], object]

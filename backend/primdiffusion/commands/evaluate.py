@@ -214,8 +214,7 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
 
 def _model_images(model: DiffusionModel, command: EvaluateGeneration, poses: BodyPose) -> Iterator[TestImage]:
     for seed in range(command.first_seed, command.first_seed + command.count):
-        human = generate(model, seed, command.steps)
-        yield from human_images(human, poses, command.views, f"{seed:06d}", MARCH, best_device())
+        yield from human_images(generate(model, seed, command.steps), poses, command.views, MARCH, best_device())
 
 
 def _scores(images: Iterator[TestImage], networks: Networks, what: str) -> Scores:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from PIL.Image import Image as PillowImage
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,7 +19,7 @@ from primdiffusion.capture.coco import JOINTS
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.image import encode_srgb, to_bytes
+from primdiffusion.geometry.image import Image, decode_srgb, encode_srgb, to_bytes
 from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.assets import Assets
@@ -45,45 +45,29 @@ SUFFIXES, FORMATS = (".png", ".jpg", ".jpeg", ".webp"), ("PNG", "JPEG", "WEBP")
 
 @dataclasses.dataclass(frozen=True)
 class TestImage:
-    """A picture of one human: where it comes from, and its truth where that is known."""
+    """A picture of one human, and where its joints are. Of a file only colours and mask are known."""
 
-    subject: str
-    """The human, or the file."""
-    rgb: Float[Tensor, "h w 3"]
-    """sRGB-encoded in [0, 1], over white or black."""
-    alpha: Float[Tensor, "h w"]
-    frame: int = 0
-    """Index of the pose."""
-    view: int = 0
-    """Index of the camera."""
+    image: Image
     joints: Float[Tensor, "12 2"] | None = None
     """JOINTS in pixels."""
     head_size: float | None = None
     """Pixels between the joints HEAD."""
-    depth: Float[Tensor, "h w"] | None = None
-    """Metres along the optical axis; inf for background."""
 
     @property
     def mask(self) -> Bool[Tensor, "h w"]:
         """Pixels of the human."""
-        return self.alpha >= 0.5
+        return torch.from_numpy(self.image.alpha >= 0.5)
+
+    @property
+    def depth(self) -> Float[Tensor, "h w"]:
+        """Metres along the optical axis; inf where `mask` is false, and in pictures of files."""
+        return torch.where(self.mask, torch.from_numpy(self.image.depth), torch.inf)
 
     @property
     def pixels(self) -> UInt8[Tensor, "h w 3"]:
-        """The colours as a file stores them."""
-        return to_bytes(self.rgb)
-
-    @property
-    def rgba(self) -> UInt8[Tensor, "h w 4"]:
-        """Colours over the same background, and alpha, as a file stores them."""
-        return torch.cat([self.pixels, to_bytes(self.alpha)[..., None]], -1)
-
-
-def image_over(
-    background: float, subject: str, rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], frame: int, view: int
-) -> TestImage:
-    """A render (linear, premultiplied) over black (0) or white (1)."""
-    return TestImage(subject, encode_srgb((rgb + background * (1 - alpha[..., None])).clamp(0, 1)), alpha, frame, view)
+        """Colours over white, as a file stores them."""
+        white = self.image.rgb + (1 - self.image.alpha[..., None])
+        return to_bytes(encode_srgb(torch.from_numpy(white).clamp(0, 1)))
 
 
 def body_camera(vertices: Float[Tensor, "V 3"], yaw: float, side: int = SIDE) -> Camera:
@@ -96,40 +80,36 @@ def body_camera(vertices: Float[Tensor, "V 3"], yaw: float, side: int = SIDE) ->
 
 
 def human_images(
-    human: Human, poses: BodyPose, views: int, subject: str, settings: MarchSettings, device: torch.device
+    human: Human, poses: BodyPose, views: int, settings: MarchSettings, device: torch.device
 ) -> Iterator[TestImage]:
     """A human in all poses [F] from all views, drawn by the marcher on `device`."""
     body, anchors = body_of(human)
     for frame in range(len(poses.joint_rotation)):
         posed = pose_body(human.betas, poses.map(lambda t, n=frame: t[n]), body)
         primitives = Primitives.place(attach(anchors, posed.vertices, body.faces), human.payload).to(device)
-        yield from primitive_images(primitives, posed, views, subject, settings, frame)
+        yield from primitive_images(primitives, posed, views, settings)
 
 
 def primitive_images(
-    primitives: Primitives, posed: PosedBody, views: int, subject: str, settings: MarchSettings, frame: int = 0
+    primitives: Primitives, posed: PosedBody, views: int, settings: MarchSettings
 ) -> Iterator[TestImage]:
     """Primitives from all views around a body, drawn by the marcher on their device."""
     for view in range(views):
         camera = body_camera(posed.vertices, 2 * math.pi * view / views)
         seen = march(primitives, camera.to(primitives.position.device), settings).to("cpu")
-        image = image_over(1, subject, seen.rgb, seen.alpha, frame, view)
-        yield _with_truth(image, seen.depth / camera.secants(), posed.joints, camera)  # distances are along rays
+        depth = seen.depth / camera.secants()  # distances are along rays
+        yield _with_joints(Image(seen.rgb.numpy(), seen.alpha.numpy(), depth.numpy()), posed, camera)
 
 
-def mesh_images(
-    person: Person, poses: BodyPose, yaws: Sequence[Sequence[float]], subject: str, side: int
-) -> Iterator[TestImage]:
+def mesh_images(person: Person, poses: BodyPose, yaws: Sequence[Sequence[float]], side: int) -> Iterator[TestImage]:
     """A dressed mesh in poses [F], each from its own yaws, rasterised with SUPERSAMPLE^2 samples a pixel."""
     shaped = default_body().shape(torch.from_numpy(person.betas).float())
     for frame, of_pose in enumerate(yaws):
         posed = shaped.pose(poses.map(lambda t, n=frame: t[n]))
         mesh = person.mesh.posed(posed.skinning.double().numpy())
-        for view, yaw in enumerate(of_pose):
+        for yaw in of_pose:
             camera = body_camera(posed.vertices, yaw, side)
-            seen = rasterise(mesh, camera, SUPERSAMPLE)
-            image = image_over(1, subject, torch.from_numpy(seen.rgb), torch.from_numpy(seen.alpha), frame, view)
-            yield _with_truth(image, torch.from_numpy(seen.depth), posed.joints, camera)
+            yield _with_joints(rasterise(mesh, camera, SUPERSAMPLE), posed, camera)
 
 
 def mesh_images_of_seeds(assets: Assets, seeds: Sequence[int], poses: BodyPose, views: int) -> Iterator[TestImage]:
@@ -137,17 +117,14 @@ def mesh_images_of_seeds(assets: Assets, seeds: Sequence[int], poses: BodyPose, 
     base = load_base_mesh()
     yaws = [[2 * math.pi * view / views for view in range(views)]] * len(poses.joint_rotation)
     for seed in seeds:
-        yield from mesh_images(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
+        yield from mesh_images(make_person(assets, base, seed), poses, yaws, SIDE)
 
 
-def _with_truth(
-    image: TestImage, depth: Float[Tensor, "h w"], joints: Float[Tensor, "24 4 4"], camera: Camera
-) -> TestImage:
-    depth = torch.where(image.mask, depth, torch.inf)
-    pixels, _ = camera.project(joints[:, :3, 3])
+def _with_joints(image: Image, posed: PosedBody, camera: Camera) -> TestImage:
+    pixels, _ = camera.project(posed.joints[:, :3, 3])
     neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
     own = pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]]
-    return dataclasses.replace(image, depth=depth, joints=own, head_size=float((neck - head).norm()))
+    return TestImage(image, own, float((neck - head).norm()))
 
 
 def folder_pictures(folder: Path) -> list[Path]:
@@ -167,7 +144,8 @@ def folder_images(folder: Path) -> Iterator[TestImage]:
         shrunk, has_alpha = _read_picture(path)
         rgb = shrunk[..., :3]
         alpha = shrunk[..., 3] if has_alpha else (rgb * 255 < 255 - WHITE_DISTANCE).any(-1).float()
-        yield TestImage(path.name, rgb, alpha)
+        over_black = decode_srgb(rgb) - (1 - alpha[..., None])
+        yield TestImage(Image(over_black.numpy(), alpha.numpy(), np.full(alpha.shape, np.inf, np.float32)))
 
 
 def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], bool]:
@@ -180,7 +158,7 @@ def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], bool]:
     raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
 
 
-def _over_white(picture: Image.Image) -> tuple[Float[Tensor, "s s 4"], bool]:
+def _over_white(picture: PillowImage) -> tuple[Float[Tensor, "s s 4"], bool]:
     """Colour over white and alpha, resized to SIDE; whether any of it is transparent."""
     rgba = np.asarray(picture.convert("RGBA"))
     values = torch.from_numpy(rgba.astype(np.float32)) / 255

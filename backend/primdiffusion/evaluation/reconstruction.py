@@ -11,14 +11,17 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from primdiffusion.capture.conditioning import body_betas, conditioning_views, spread_cameras
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.model import EncoderModel
-from primdiffusion.evaluation.images import TestImage, image_over, markdown_table
+from primdiffusion.evaluation.images import markdown_table
 from primdiffusion.evaluation.metrics import Lpips, bounding_box, overlap, psnr, ssim
 from primdiffusion.formats.requests import Count
 from primdiffusion.formats.schema import Checked, Range
+from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.render.march import MarchSettings, march
 
 
@@ -113,30 +116,31 @@ def evaluate(
             for index, camera in enumerate(cameras):
                 view = targets.camera.map(lambda tensor, index=index: tensor[index])
                 drawn = march(primitives, view.to(device), settings.march)
-                image = image_over(0, name, drawn.rgb, drawn.alpha, frame, camera)
-                rgba = targets.rgba[index].to(device).to(image.rgb.dtype) / 255
-                target = TestImage(name, rgba[..., :3], rgba[..., 3], frame, camera)
+                rgba = torch.cat([encode_srgb(drawn.rgb.clamp(0, 1)), drawn.alpha[..., None]], -1)
+                target = targets.rgba[index].to(device).to(rgba.dtype) / 255
                 yield PictureScore(
                     subject=name,
                     frame=frame,
                     camera=camera,
                     given_view=camera in given,
                     given_pose=frame == settings.given_frame,
-                    likeness=image_metrics(image, target, lpips),
+                    likeness=image_metrics(rgba, target, lpips),
                 )
 
 
-def image_metrics(image: TestImage, target: TestImage, lpips: Lpips | None = None) -> ImageMetrics:
-    """Compare a picture with the true one; both over black."""
-    pair = image.rgb, target.rgb
-    box = bounding_box(target.alpha > 0)
-    cut = None if box is None else (box.cut(image.rgb), box.cut(target.rgb))
+def image_metrics(
+    image: Float[Tensor, "h w 4"], target: Float[Tensor, "h w 4"], lpips: Lpips | None = None
+) -> ImageMetrics:
+    """Compare a picture with the true one; both have sRGB-encoded colours over black, and alpha."""
+    pair = image[..., :3], target[..., :3]
+    box = bounding_box(target[..., 3] > 0)
+    cut = None if box is None else (box.cut(pair[0]), box.cut(pair[1]))
     return ImageMetrics(
         psnr=float(psnr(*pair)),
         ssim=float(ssim(*pair)),
         psnr_box=None if cut is None else float(psnr(*cut)),
         ssim_box=None if cut is None else float(ssim(*cut)),
-        mask_iou=overlap(image.mask, target.mask),
+        mask_iou=overlap(image[..., 3] >= 0.5, target[..., 3] >= 0.5),
         lpips=None if lpips is None else float(lpips(*pair)),
     )
 

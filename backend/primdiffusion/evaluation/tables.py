@@ -100,13 +100,12 @@ def look_at_pictures(
         found = joint_positions(seen.heatmaps)
         for number, image in enumerate(batch):
             if image.joints is not None and image.head_size is not None:
-                right = correct_joints(found[number] * image.rgb.shape[0], image.joints, image.head_size)
+                right = correct_joints(found[number] * len(image.image.rgb), image.joints, image.head_size)
                 correct.append(float(right.double().mean()))
-            if image.depth is not None:
-                cells = cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask)
-                error = depth_error(seen.depth[number], 1 / cells, cells > 0)
-                if error is not None:
-                    depth.append(error)
+            cells = cell_means(1 / image.depth, image.mask)
+            error = depth_error(seen.depth[number], 1 / cells, cells > 0)
+            if error is not None:
+                depth.append(error)
         count += len(batch)
         report(count)
     stacked = {name: torch.cat(parts).clone() for name, parts in features.items() if parts}

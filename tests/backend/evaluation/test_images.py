@@ -22,7 +22,7 @@ def human():
 @pytest.fixture(scope="module")
 def image(human):
     """The left side of a human, which has views at 0, 90, 180 and 270 degrees."""
-    drawn = human_images(human, choose_poses([], 1, 0), 4, "person", MarchSettings(step=0.02), torch.device("cpu"))
+    drawn = human_images(human, choose_poses([], 1, 0), 4, MarchSettings(step=0.02), torch.device("cpu"))
     return [next(drawn), next(drawn)][1]
 
 
@@ -55,10 +55,11 @@ def test_a_folder_gives_what_was_drawn(image, tmp_path):
     Image.new("RGB", (256, 256), "white").save(tmp_path / "white.png")
     one, two, white = folder_images(tmp_path)
     assert torch.equal(one.pixels, rgb)
-    assert (one.joints, one.head_size, one.depth) == (None, None, None)
+    assert (one.joints, one.head_size) == (None, None)
+    assert torch.isinf(one.depth).all()
     assert torch.equal(two.mask, image.mask)
-    assert (two.rgb[~two.mask] == 1).all()
-    assert white.rgb.shape == (SIDE, SIDE, 3)
+    assert (two.pixels[~two.mask] == 255).all()
+    assert white.pixels.shape == (SIDE, SIDE, 3)
     assert not white.mask.any()
 
 
@@ -83,7 +84,7 @@ def test_meshes_are_drawn_around_their_joints():
     except FileNotFoundError as error:
         pytest.skip(str(error))
     person = make_person(assets, load_base_mesh(), 7)
-    (image,) = mesh_images(person, choose_poses([], 1, 0), [[0.0]], "7", 256)
+    (image,) = mesh_images(person, choose_poses([], 1, 0), [[0.0]], 256)
     column, row = image.joints.round().long().unbind(-1)
     assert image.mask[row, column].all()
     side = [JOINTS.index(f"{side}_shoulder") for side in ("left", "right")]

@@ -4,9 +4,10 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image as Pillow
 from primdiffusion.commands import evaluate as command
 from primdiffusion.evaluation.images import JOINTS, SIDE
 from primdiffusion.evaluation.images import TestImage as Picture
@@ -22,6 +23,7 @@ from primdiffusion.evaluation.tables import (
     remarks,
     table,
 )
+from primdiffusion.geometry.image import Image, decode_srgb
 from support.errors import refused
 from support.tiny import tiny_model
 
@@ -37,22 +39,22 @@ def images(count: int, seed: int) -> list[Picture]:
     """Boxes in random places; a plane of depth."""
     generator = torch.Generator().manual_seed(seed)
     found = []
-    for number in range(count):
+    for _ in range(count):
         left, top = torch.randint(50, 200, (2,), generator=generator).tolist()
         mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
         mask[top : top + 250, left : left + 150] = True
         shade = torch.randint(0, 200, (SIDE, SIDE, 3), generator=generator, dtype=torch.uint8)
         depth = torch.where(mask, torch.linspace(3, 4, SIDE)[:, None], torch.inf)
         joints = torch.tensor([left, top]) + 100 * torch.rand(len(JOINTS), 2, generator=generator)
-        rgb = torch.where(mask[..., None], shade, 255)
-        found.append(Picture(str(number), rgb / 255, mask.float(), joints=joints, head_size=30.0, depth=depth))
+        rgb = np.where(mask[..., None], decode_srgb(shade.float() / 255), 0).astype(np.float32)
+        found.append(Picture(Image(rgb, mask.float().numpy(), depth.numpy()), joints, head_size=30.0))
     return found
 
 
 def folder(path, count: int, seed: int):
     path.mkdir()
-    for image in images(count, seed):
-        Image.fromarray(image.pixels.numpy()).save(path / f"{image.subject}.png")
+    for number, image in enumerate(images(count, seed)):
+        Pillow.fromarray(image.pixels.numpy()).save(path / f"{number}.png")
     return path
 
 
