@@ -15,7 +15,6 @@ from primdiffusion.formats.requests import (
     GenerateRequest,
     InpaintRequest,
     InterpolateRequest,
-    PayloadMethod,
     Person,
     Pixels,
     PoseOptions,
@@ -113,7 +112,7 @@ class PeopleCommand(MadePeople):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PayloadsCommand(MadePeople):
-    """Make dressed humans as primitives: the training set of the diffusion model.
+    """Make dressed humans as primitives fitted to renders of their meshes: the training set of the diffusion model.
 
     `payloads encode` makes them from captures instead (with its own --help).
     """
@@ -122,9 +121,6 @@ class PayloadsCommand(MadePeople):
     """Folder to write person_NNNNNN.npz into; complete ones are skipped."""
     variants: Count = 4
     """Colourings of each human."""
-    making: PayloadMethod = "fitted"
-    """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
-    takes the colour of the nearest surface point, 2 s, blurred."""
     checkpoint: Path | None = None
     """Model from whose guesses fits start, so that similar humans get similar primitives; the default is the included
     one."""

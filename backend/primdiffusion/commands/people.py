@@ -40,7 +40,6 @@ def payloads(command: PayloadsCommand, session: Session, report: ReportProgress)
         command.variants,
         command.seed,
         command.workers,
-        command.making,
         command.checkpoint,
         lambda done, total: report("payloads", done, total, None),
     )

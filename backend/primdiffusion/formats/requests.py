@@ -32,8 +32,6 @@ SIDED_PARTS = (
 """Left and right as seen by the human."""
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
 """Body parts that regions consist of."""
-PayloadMethod = Literal["fitted", "from_mesh"]
-"""How payloads are made: fitted to renders of the mesh, or with the colours of the nearest surface point."""
 Reconstruction = Literal["encoder", "prior"]
 """How views become a human."""
 PASSES = ("img", "mask", "depth", "normal", "part")

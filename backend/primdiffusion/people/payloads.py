@@ -7,8 +7,8 @@ rest size also have `delta_scale` float16 [variants, K, 3]; those from meshes ha
 those from captures have `source` (JSON: images and encoder) and may have no seed. Files are written atomically;
 a second run skips complete ones.
 
-`from_mesh` gives each voxel the colour of the nearest surface point, which blurs because about four boxes overlap at
-every point. Fitting optimises the sum of the overlapping boxes against renders of the mesh instead.
+Voxels with the colour of the nearest surface point (`from_mesh`) draw a blurred human, because about four boxes overlap
+at every point. So the sum of the overlapping boxes is fitted to renders of the mesh.
 
 Most of what pictures leave open, numbers that cancel between overlapping boxes, would be particular to each human, and
 no network could learn it. So a fit starts from what a trained model makes of the mesh's own colours, and is pulled
@@ -34,7 +34,6 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.files.arrays import read_arrays, write_deflated
 from primdiffusion.files.whole_files import atomic_path
-from primdiffusion.formats.requests import PayloadMethod
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -52,8 +51,8 @@ from primdiffusion.runtime.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-VERSIONS: dict[PayloadMethod, str] = {"fitted": "fitted 2", "from_mesh": "from_mesh 2"}
-"""Method and version stored in files, followed by the checkpoint for fits; those of others are made again."""
+METHOD = "fitted 2"
+"""Method and version stored in files, followed by the checkpoint; those of others are made again."""
 GUESS_LEVEL = 100
 """Step at which the model denoises the mesh's own colours, to make the start of a fit."""
 
@@ -65,14 +64,13 @@ def make_payloads(
     variants: int,
     seed: int,
     workers: int,
-    making: PayloadMethod = "fitted",
     checkpoint: Path | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
     """Write the missing files of seeds seed ... seed + count - 1 to `out_dir`; return the paths of all.
 
-    A fitted sample of four variants takes the better part of a minute on one core (`from_mesh`: 2 s). Fits start from
-    guesses of `checkpoint` (None: the included one). `report` receives the number of finished samples and the total.
+    A sample of four variants takes the better part of a minute on one core. Fits start from guesses of `checkpoint`
+    (None: the included one). `report` receives the number of finished samples and the total.
 
     Raises:
         ValueError: a count is not positive; the checkpoint is damaged; a worker process was killed.
@@ -81,7 +79,7 @@ def make_payloads(
     for name, value in (("count", count), ("variants", variants), ("workers", workers)):
         if value < 1:
             raise ValueError(f"{name} is {value}: give 1 or more")
-    method = _method(making, checkpoint)
+    method = _method(checkpoint)
     out_dir.mkdir(parents=True, exist_ok=True)
     paths = [out_dir / f"person_{person_seed:06d}.npz" for person_seed in range(seed, seed + count)]
     jobs = [
@@ -91,32 +89,26 @@ def make_payloads(
     ]
     done = count - len(jobs)
     report(done, count)
-    work = [(assets, path, variants, person_seed, making, checkpoint) for path, person_seed in jobs]
+    work = [(assets, path, variants, person_seed, checkpoint) for path, person_seed in jobs]
     for _ in each(write_payloads, work, workers):
         done += 1
         report(done, count)
     return paths
 
 
-def write_payloads(
-    assets: Assets, path: Path, variants: int, seed: int, making: PayloadMethod, checkpoint: Path | None = None
-) -> None:
+def write_payloads(assets: Assets, path: Path, variants: int, seed: int, checkpoint: Path | None) -> None:
     """Generate one sample in all colourings and write its file, atomically."""
     colourings = coloured_people(assets, seed, variants)
     person = colourings[0]
     meshes, frames = [variant.mesh for variant in colourings], rest_frames(person.betas)
-    if making == "fitted":
-        payloads = fitted_payloads(meshes, frames, person.betas, _model(checkpoint))
-    else:
-        field = surface_field(person.mesh, frames)
-        payloads = [colour(field, mesh) for mesh in meshes]
+    payloads = fitted_payloads(meshes, frames, person.betas, _model(checkpoint))
     attributes = {**person.attributes, "variants": [variant.attributes for variant in colourings]}
     entries = {
         "voxels": np.stack([voxels_from_payload(payload) for payload in payloads]),
         "betas": person.betas,
         "attributes": json.dumps(attributes),
         "seed": seed,
-        "making": _method(making, checkpoint),
+        "making": _method(checkpoint),
     }
     store_payloads(path, entries)
 
@@ -126,10 +118,9 @@ def _model(checkpoint: Path | None) -> DiffusionModel:
     return load_checkpoint(checkpoint)
 
 
-def _method(making: PayloadMethod, checkpoint: Path | None) -> str:
-    """Method and version for a file, with the checkpoint of a fit."""
-    of_model = f" from {_model(checkpoint).card['sha256'][:12]}" if making == "fitted" else ""
-    return VERSIONS[making] + of_model
+def _method(checkpoint: Path | None) -> str:
+    """Method and version for a file, with the checkpoint."""
+    return f"{METHOD} from {_model(checkpoint).card['sha256'][:12]}"
 
 
 def coloured_people(assets: Assets, seed: int, variants: int) -> list[Person]:
