@@ -171,7 +171,7 @@ def chosen_compute(machine: Machine, wish: str, available: Iterable[str]) -> tup
         found = ", ".join(NAMES[name] for name in sorted(available))
         raise ValueError(f"there are no packages for {NAMES[wish]} here, but for {found}: choose another, or Automatic")
     if wish == "cuda" and not machine.nvidia:
-        return wish, "No NVIDIA driver was found: the backend will compute on the CPU until there is one"
+        return wish, "No NVIDIA driver was found: the backend will compute on the CPU until there is one."
     return wish, ""
 
 
@@ -180,12 +180,9 @@ def _automatic(machine: Machine, available: set[str]) -> tuple[str, str]:
     if not machine.nvidia:
         return fallback, ""
     if machine.driver is not None and machine.driver < CUDA_DRIVER:
-        return fallback, f"The NVIDIA driver {machine.driver} is too old for CUDA: {CUDA_DRIVER} or newer is needed"
+        return fallback, f"The NVIDIA driver {machine.driver} is too old for CUDA: {CUDA_DRIVER} or newer is needed."
     if "cuda" not in available:
-        return (
-            fallback,
-            "There are no CUDA packages of known hashes for this Blender: the CPU is used (see the manual)",
-        )
+        return fallback, "No CUDA packages of known hashes exist for this Blender: the CPU is used (see the manual)."
     return "cuda", ""
 
 

@@ -10,7 +10,7 @@ import traceback
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
-from ..backend.requests import RequestError, Steps, error_text, sentence
+from ..backend.requests import RequestError, Steps, sentence
 from ..engine import drawing_child
 from ..files.regular_files import printable
 from ..places import backend_is_named
@@ -110,7 +110,7 @@ class Reporting:
         try:
             return self.act(context)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, error_text(error))
+            self.report({"ERROR"}, sentence(error))
         return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
@@ -220,7 +220,7 @@ class Session:
         try:
             step = next(self._steps)
         except StopIteration as done:
-            self._steps, self.notice = None, done.value
+            self._steps, self.notice = None, sentence(done.value)
         except (RuntimeError, OSError) as error:
             self._steps, self.error = None, sentence(error)
         else:

@@ -199,7 +199,7 @@ class Queue:
             raise RuntimeError("no result is ready: call tick until ready")
         notice, error = "", None
         try:
-            notice = entry.job.finish(context, self.request.result, self._folder)
+            notice = sentence(entry.job.finish(context, self.request.result, self._folder))
         except (ValueError, OSError, RuntimeError) as e:
             error = error_in_the_scene(e)
         except Exception as e:

@@ -26,6 +26,7 @@ from ..scene.representation import (
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
+from .generate_settings import SAMPLER_NAMES
 from .on_person import HumanOperator
 
 REPRESENTATIONS = (
@@ -219,7 +220,7 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
     frames.what = "FRAMES"
     if merged_of(person) is not None:
         if outdated(person, context.scene):
-            draw_lines(layout, "The merged volume is of another pose: merge again to update it", "ERROR")
+            draw_lines(layout, "The merged volume is of another pose: merge again to update it.", "ERROR")
         layout.operator("primdiffusion.merge", text="Unmerge", icon="X").what = "NOTHING"
 
 
@@ -249,7 +250,7 @@ def details(person: bpy.types.Object) -> list[tuple[str, str]]:
     provenance = provenance_of(person)
     attributes, edits = provenance.get("attributes"), provenance.get("edits")
     shown = {name: provenance[name] for name in _SHOWN if provenance.get(name) not in (None, "")}
-    lines = [(name.capitalize(), as_shown(value)) for name, value in shown.items()]
+    lines = [(name.capitalize(), as_shown(SAMPLER_NAMES.get(str(value), value))) for name, value in shown.items()]
     if isinstance(attributes, dict):
         lines += [(as_shown(name.capitalize()), as_shown(value)) for name, value in attributes.items()]
     if isinstance(missed := provenance.get("unfollowed"), dict):

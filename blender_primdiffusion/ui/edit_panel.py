@@ -262,7 +262,7 @@ def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
 
 
 def _reason(settings: bpy.types.PropertyGroup) -> str:
-    return "" if settings.other is not None else "Choose the other human above"
+    return "" if settings.other is not None else "Choose the other human above."
 
 
 def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Context) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.requests import error_text
+from ..backend.requests import sentence
 from ..formats.requests import GaussiansRequest, ProxyRequest
 from ..jobs.export import (
     AddProxyJob,
@@ -121,7 +121,7 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         try:
             person = self.person(context)
         except ValueError as error:
-            self.report({"ERROR"}, error_text(error))
+            self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         if not self.filepath:
             ending = ENDINGS[context.scene.primdiffusion_export.format][0]
@@ -151,7 +151,7 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         path = destination(self.filepath, ENDINGS[kind])
         if kind == "HUMAN":
             write_human(person, path)
-            self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+            self.report({"INFO"}, f"Exported {person.name} to {path.name}.")
             return {"FINISHED"}
         return submit(self, context, self._job(context, person, kind, path))
 
@@ -257,7 +257,7 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     draw_representations(layout, person)
     layout.operator("primdiffusion.set_representation", text="Remove Mesh Proxy", icon="X").representation = "NO_MESH"
     if outdated:
-        draw_lines(layout, "Shape or clothes have changed: add it again", "INFO")
+        draw_lines(layout, "Shape or clothes have changed: add it again.", "INFO")
 
 
 def draw_from_file(layout: bpy.types.UILayout) -> None:

@@ -60,7 +60,7 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
         ready = draw_set_up(layout)
         if not ready:
             draw_samples(layout)
-        reason = "" if ready else "Set up the backend first"
+        reason = "" if ready else "Set up the backend first."
         column = layout.column()
         row = column.row(align=True)
         row.prop(settings, "seed")

@@ -220,6 +220,7 @@ _SAMPLERS = {
     "ddpm": ("DDPM", "New noise at each step; needs many steps"),
 }
 SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
+SAMPLER_NAMES = {name: label for name, label, _ in SAMPLER_ITEMS}
 
 
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):

@@ -87,10 +87,10 @@ def draw_pose(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row = layout.row()
         row.use_property_split = False  # a button over the whole width
         row.prop(context.space_data, "show_region_asset_shelf", text="Show Poses", toggle=True, icon="ASSET_MANAGER")
-        draw_lines(layout, "Click a pose to apply it, drag to blend, right-click to flip it", "INFO")
+        draw_lines(layout, "Click a pose to apply it, drag to blend, right-click to flip it.", "INFO")
     else:
         layout.operator("object.posemode_toggle", text="Pose Mode", icon="POSE_HLT")
-        draw_lines(layout, "Poses are in the asset shelf of Pose Mode", "INFO")
+        draw_lines(layout, "Poses are in the asset shelf of Pose Mode.", "INFO")
     try:
         armature = target_armature(context)
     except ValueError:

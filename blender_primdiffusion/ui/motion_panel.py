@@ -82,9 +82,9 @@ class PRIMDIFFUSION_OT_import_motion(ArmatureOperator, WhereTo, ImportHelper, bp
             extend_range(context.scene, last)
         warn_of_rest(self, armature)
         if motion.detected.doubt:
-            self.report({"WARNING"}, motion.detected.doubt)
+            self.report({"WARNING"}, sentence(motion.detected.doubt))
         found = f"{motion.detected.rig or 'unknown rig'}, {motion.detected.up} up, {motion.fps:.4g} fps"
-        self.report({"INFO"}, f"{motion.name} ({found}): {len(motion)} frames on frames {first:g} to {last:g}")
+        self.report({"INFO"}, f"{motion.name} ({found}): {len(motion)} frames on frames {first:g} to {last:g}.")
         return {"FINISHED"}
 
     def axis(self) -> str:
@@ -170,7 +170,7 @@ class PRIMDIFFUSION_OT_export_motion(ArmatureOperator, ExportHelper, bpy.types.O
         motion, betas, pelvis = sample_motion(context, armature, range(first, last + 1))
         path = destination(self.filepath, (".npz",))
         write_amass(path, motion, betas, pelvis)
-        self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}")
+        self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}.")
         return {"FINISHED"}
 
 

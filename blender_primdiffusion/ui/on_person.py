@@ -75,7 +75,7 @@ def may_have_joints(context: bpy.types.Context) -> bool:
 def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> None:
     """Warn where the armature is shown in its rest position."""
     if armature.data.pose_position == "REST":
-        operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position")
+        operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position.")
 
 
 class ArmatureOperator(HumanOperator):

@@ -80,7 +80,7 @@ class PRIMDIFFUSION_OT_choose_picture(Reporting, bpy.types.Operator):
         marked = all(image.depth in (32, 128) for image in pictures_of(camera))  # bits of a pixel with alpha
         if person is None and not (marked or context.scene.primdiffusion_picture.mask):
             _stand(context, build_human(context, min(FOLDER.glob("*.human"))))
-            self.report({"INFO"}, "Pose the human over the person in the picture, then press Make Human")
+            self.report({"INFO"}, "Pose the human over the person in the picture, then press Make Human.")
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
             bpy.ops.view3d.view_center_camera()

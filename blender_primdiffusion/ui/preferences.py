@@ -60,13 +60,13 @@ def known() -> Known:
         line = f"Ready: torch {about.get('torch')}, Python {about.get('python')}, {about.get('device') or 'CPU'}"
         size = about.get("bytes", 0)
         if setup.is_outdated(about):
-            return Known("outdated", f"{line}. Made for another version of the extension: press Repair", size)
+            return Known("outdated", f"{line}. Made for another version of the extension: press Repair.", size)
         return Known("ready", line, size)
     if own_python_has_backend(bundled=setup is not None):
-        return Known("own Python", "Uses Blender's own Python, which has torch")
+        return Known("own Python", "Uses Blender's own Python, which has torch.")
     if state == "broken":
-        return Known("broken", "Half installed, or made by a Blender that is gone: press Repair")
-    return Known("absent", "The backend is not set up yet" if setup else sentence(NOT_INSTALLED))
+        return Known("broken", "Half installed, or made by a Blender that is gone: press Repair.")
+    return Known("absent", "The backend is not set up yet." if setup else sentence(NOT_INSTALLED))
 
 
 def draw_set_up(layout: bpy.types.UILayout) -> bool:

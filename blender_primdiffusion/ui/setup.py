@@ -22,7 +22,7 @@ from .declared import SKIP
 from .drawing import draw_lines
 
 LOCKS = Path(__file__).resolve().parents[1] / "requirements"
-_ONLINE = "Blender may not use the network: allow it, or name an existing Python in the preferences"
+_ONLINE = "Blender may not use the network: allow it, or name an existing Python in the preferences."
 
 
 session = Session(
@@ -154,7 +154,7 @@ class PRIMDIFFUSION_OT_set_up_backend(Reporting, bpy.types.Operator):
             raise ValueError("the backend is being set up already; wait for it, or press Cancel")
         state, about = state_of(set_up_folder())
         if not self.repair and state == "ready" and about.get("compute") == chosen()[0]:
-            self.report({"INFO"}, "the backend is set up already; press Repair to reinstall it")
+            self.report({"INFO"}, "The backend is set up already: press Repair to reinstall it.")
             return {"FINISHED"}
         steps = installing()
         if queue.busy:

@@ -161,7 +161,7 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
         random_betas = np.clip(drawn, -_FARTHEST, _FARTHEST)
         warning = reshape(person, random_betas if self.to == "RANDOM" else generated_betas(person))
         if warning:
-            self.report({"WARNING"}, warning)
+            self.report({"WARNING"}, sentence(warning))
         return {"FINISHED"}
 
 

@@ -249,7 +249,7 @@ def test_the_panel_jobs_is_shown_only_while_there_are_any_and_cancel_says_what_i
         ops.cancel()
     number = ask(11)
     assert shows(addon)
-    refusals = {"number": (number + 1, "queued"), "what": ("CAPTURES", "no captures")}
+    refusals = {"number": (number + 1, "queued"), "what": ("CAPTURES", "captures")}
     for name, (value, named) in refusals.items():
         with refused(RuntimeError, named):
             ops.cancel(**{name: value})

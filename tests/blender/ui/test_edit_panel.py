@@ -167,8 +167,8 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(person, a
     rejected = {
         "select the one you mean": lambda: ops.vary(),
         "'Eve' is not in the scene: choose from 'Human', 'Human.001'": lambda: ops.vary(human="Eve"),
-        "choose the other human in the panel first": lambda: ops.blend(human="Human"),
-        "no part of the body is chosen": lambda: ops.redress(human="Human"),
+        "Choose the other human in the panel first": lambda: ops.blend(human="Human"),
+        "No part of the body is chosen": lambda: ops.redress(human="Human"),
     }
     for sentence, edit in rejected.items():
         with pytest.raises(RuntimeError, match=sentence):

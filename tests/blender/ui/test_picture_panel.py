@@ -263,7 +263,7 @@ def test_without_picture_human_or_equal_size_there_is_a_sentence(addon, picture)
     with refused(RuntimeError, "Choose Picture"):
         bpy.ops.primdiffusion.human_from_picture()
     bpy.ops.primdiffusion.choose_picture(filepath=str(picture))
-    with refused(RuntimeError, "select the human"):
+    with refused(RuntimeError, "Select the human"):
         bpy.ops.primdiffusion.human_from_picture(only_fit=True)
     person = a_human()
     with refused(RuntimeError, person.name, "body"):
@@ -271,7 +271,7 @@ def test_without_picture_human_or_equal_size_there_is_a_sentence(addon, picture)
     addon.scene.render.resolution_x = 99
     with refused(RuntimeError, "99 x 80", "60 x 80"):
         bpy.ops.primdiffusion.human_from_picture()
-    with refused(RuntimeError, "choose a picture"):
+    with refused(RuntimeError, "Choose a picture"):
         bpy.ops.primdiffusion.choose_picture()
 
 
