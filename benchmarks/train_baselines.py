@@ -33,6 +33,7 @@ from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.image import decode_srgb
 from primdiffusion.people.payloads import rest_frames
@@ -207,7 +208,8 @@ def train_model(config: TrainingConfig, kind: str, out: Path, minutes: float, th
     def save(about: dict[str, object]) -> None:
         named = {"name": f"{kind}, of a comparison on equal time", "baseline": kind}
         card = {**named, "full_density": prepared.full_density, **about}
-        save_checkpoint(out / "model.safetensors", dataclasses.replace(task.model(), card=card), str(config.schedule))
+        model = dataclasses.replace(task.model(), card=card)
+        save_checkpoint(out / "model.safetensors", model, schedule_name(model.schedule))
 
     train(Run(denoiser, objective, task.settings, prepared.train, out, config.seed, threads), minutes, save)
 

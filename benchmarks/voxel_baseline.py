@@ -25,7 +25,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
-from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
 from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
@@ -56,7 +56,7 @@ BLOCKS = SIDE // BLOCK
 VALUES = 4 * BLOCK**3
 CELLS_EACH = 256
 """Cells of each sample that the principal components are fitted to."""
-SCHEDULE, CHAIN = "fine_linear", "dense"
+SCHEDULE = "fine_linear"
 """The default model's."""
 
 
@@ -358,7 +358,7 @@ class VoxelModel:
     def sample(self, seeds: Sequence[int], steps: int = 30) -> Iterator[VoxelPerson]:
         """Sample a person for each seed with DDIM, starting as `DiffusionModel.start` does."""
         schedule, prior = self.denoiser.schedule, self.denoiser.prior
-        chain = CHAINS[CHAIN](schedule.length, steps)
+        chain = dense_steps(schedule.length, steps)
 
         def denoise(x: Tensor, t: int) -> Tensor:
             with torch.inference_mode():
@@ -376,6 +376,15 @@ class VoxelModel:
     def primitives(self, grid: Float[Tensor, "64 64 64 4"]) -> Primitives:
         """Convert a grid to a primitive that the marcher can render."""
         return primitives_of(grid, self.full_density)
+
+
+def dense_steps(length: int, steps: int) -> list[int]:
+    """Descending t from T-1, denser at low noise: with evenly spaced steps all fine detail comes from the last one."""
+    chain = [length - 1]
+    for i in range(1, steps):
+        wanted = round(length * (1 - i / steps) ** 2.2) - 1
+        chain.append(min(max(wanted, steps - 1 - i), chain[-1] - 1))
+    return chain
 
 
 def voxel_denoiser(

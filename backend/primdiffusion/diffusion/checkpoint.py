@@ -67,7 +67,7 @@ class ModelConfig(Open):
     """Denoiser: a PersonDenoiser, a SlabUNet, or the authors' U-Net on a body of the user."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"]
     """Noise schedule."""
-    chain: Literal["trailing", "dense", "early", "released"] = "trailing"
+    chain: Literal["trailing", "early", "released"] = "trailing"
     """Timesteps of samplers."""
     full_density: Annotated[float, Range(1e-30, LARGEST_NUMBER)]
     """Density of a stored value of 1, 1/m."""

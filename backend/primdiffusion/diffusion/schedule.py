@@ -95,22 +95,22 @@ def _levels(alpha_bar: Tensor, dtype: torch.dtype, device: torch.device) -> tupl
     return every[0].to(device), every[1].to(device)
 
 
-def linear(length: int = 1000, first: float = 1e-4, last: float = 2e-2) -> Schedule:
+def linear(length: int = 1000, first: float = 1e-4) -> Schedule:
     """beta linear in t: the paper's schedule (DDPM's; SPEC 1.4)."""
-    return _from_betas(torch.linspace(first, last, length, dtype=torch.float64))
+    return _from_betas(torch.linspace(first, 2e-2, length, dtype=torch.float64))
 
 
-def sqrt_linear(length: int = 1000, first: float = 1e-4, last: float = 2e-2) -> Schedule:
+def sqrt_linear(length: int = 1000) -> Schedule:
     """sqrt(beta) linear in t: the released code's schedule, which it also calls linear (SPEC 1.4)."""
-    return _from_betas(torch.linspace(first**0.5, last**0.5, length, dtype=torch.float64) ** 2)
+    return _from_betas(torch.linspace(1e-4**0.5, 2e-2**0.5, length, dtype=torch.float64) ** 2)
 
 
-def fine_linear(length: int = 1000, last: float = 2e-2) -> Schedule:
+def fine_linear(length: int = 1000) -> Schedule:
     """beta linear in t from nearly 0, so that the first steps hold less noise than the finest detail of people.
 
     With DDPM's first beta of 1e-4 the noise never falls below 0.01, which is as large as the differences between faces.
     """
-    return linear(length, last / (10 * length), last)
+    return linear(length, 2e-3 / length)
 
 
 SCHEDULES = {"linear": linear, "sqrt_linear": sqrt_linear, "fine_linear": fine_linear}
@@ -132,12 +132,6 @@ def trailing_steps(length: int, steps: int) -> list[int]:
     return [round(length - i * length / steps) - 1 for i in range(steps)]
 
 
-def leading_steps(length: int, steps: int, offset: int = 1) -> list[int]:
-    """Descending t = offset + i * (T // steps), as released: 991, 981, ... 1 for 100 of 1000."""
-    _check_steps(length, steps)
-    return [i * (length // steps) + offset for i in reversed(range(steps))]
-
-
 def released_steps(length: int, steps: int) -> list[int]:
     """Timesteps of the released sampler: 991, 981, ... 1 for 100 of 1000 (SPEC 3), or all of T-1 ... 0.
 
@@ -147,17 +141,8 @@ def released_steps(length: int, steps: int) -> list[int]:
         return list(reversed(range(length)))
     if length // 2 < steps < length:
         raise ValueError(f"steps is {steps}: the released chain takes up to {length // 2} steps, or all {length}")
-    return leading_steps(length, steps)
-
-
-def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
-    """Descending t from T-1, denser at low noise: with evenly spaced steps all fine detail comes from the last one."""
     _check_steps(length, steps)
-    chain = [length - 1]
-    for i in range(1, steps):
-        wanted = round(length * (1 - i / steps) ** power) - 1
-        chain.append(min(max(wanted, steps - 1 - i), chain[-1] - 1))
-    return chain
+    return [i * (length // steps) + 1 for i in reversed(range(steps))]
 
 
 def early_steps(length: int, steps: int, last: int = 50) -> list[int]:
@@ -172,7 +157,7 @@ def early_steps(length: int, steps: int, last: int = 50) -> list[int]:
     return [round(length - 1 - i * (length - 1 - lowest) / max(1, steps - 1)) for i in range(steps)]
 
 
-CHAINS = {"trailing": trailing_steps, "dense": dense_steps, "early": early_steps, "released": released_steps}
+CHAINS = {"trailing": trailing_steps, "early": early_steps, "released": released_steps}
 """Timesteps that a sampler visits, by their name in checkpoints."""
 
 
@@ -187,6 +172,4 @@ def _check_steps(length: int, steps: int) -> None:
 
 
 def _from_betas(betas: Float[Tensor, "t"]) -> Schedule:
-    if not bool(((betas > 0) & (betas < 1)).all()):
-        raise ValueError(f"every beta must lie between 0 and 1; these run from {betas.min():.3g} to {betas.max():.3g}")
     return Schedule(torch.cumprod(1.0 - betas, dim=0))

@@ -16,7 +16,7 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
-from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.diffusion.schedule import early_steps, fine_linear
 from primdiffusion.diffusion.surfaces import Surfaces
 from primdiffusion.files import tensor_file
 from primdiffusion.files.json_files import parse_json
@@ -129,7 +129,7 @@ class CellTask(DiffusionTask):
         self.surfaces = None if prepared.surfaces is None else prepared.surfaces.to(device)
         self.train, self.held = prepared.train.to(device), prepared.held.to(device)
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
-        schedule = SCHEDULES[str(config.schedule)]()
+        schedule = fine_linear()
         if base is None:
             self.denoiser = PersonDenoiser(config.model, prepared.prior, schedule)
         else:
@@ -177,7 +177,7 @@ class CellTask(DiffusionTask):
         codec, denoiser = CellCodec(self.codec), self.denoiser
         return DiffusionModel(
             denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary,
-            CHAINS[str(self.config.chain)], surfaces=self.surfaces,
+            early_steps, surfaces=self.surfaces,
         )  # fmt: skip
 
 

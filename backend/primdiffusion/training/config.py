@@ -138,12 +138,6 @@ class TrainingConfig(RunSettings):
     """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
     made_of: Literal["makehuman", "own"] = "own"
     """Data in the model card: makehuman, licence and limits of `payloads` from MakeHuman's CC0 assets; own, none."""
-    schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
-    """Noise schedule over 1000 steps: linear (the paper's; for the paper preset), fine_linear (the same with less noise
-    at the start; for the default preset) or sqrt_linear (the released code's)."""
-    chain: Literal["trailing", "dense", "early"] | None = None
-    """Timesteps in sampling: trailing (evenly spaced; for the paper preset), dense (denser at low noise) or early (down
-    to t = 50, from which the mean is taken; for the default preset)."""
     start_from: Path | None = None
     """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and size of the
     network are kept, and the network starts with its weights."""
@@ -167,11 +161,7 @@ class TrainingConfig(RunSettings):
     """Training of the paper preset's network; the batch is that of each process."""
 
     def __post_init__(self) -> None:
-        """Fill in the defaults of the preset; raise ValueError for values out of range."""
-        usual = {"default": ("fine_linear", "early"), "paper": ("linear", "trailing")}[self.preset]
-        for name, value in zip(("schedule", "chain"), usual, strict=True):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
+        """Raise ValueError for values out of range, or that the preset has not."""
         super().__post_init__()
         if self.preset == "paper" and self.slab.optimiser == "muon":
             raise ValueError("slab.optimiser is muon, which is for the default preset: choose adamw")

@@ -14,6 +14,7 @@ from accelerate import PartialState
 from primdiffusion.diffusion.checkpoint import file_hash, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.runtime.device import device_info
 from primdiffusion.training import loop
@@ -72,9 +73,10 @@ def train(config: TrainingConfig) -> DiffusionModel:
         state = loop.train(task, config, accelerator)
         model = task.model()
         if accelerator.is_main_process:
-            card = _card(config, people, chosen, held, task, state)
+            schedule = schedule_name(model.schedule)
+            card = _card(config, people, chosen, held, task, state) | {"schedule": schedule}
             model = dataclasses.replace(model, card=card)
-            save_checkpoint(config.run / MODEL, model, str(config.schedule))
+            save_checkpoint(config.run / MODEL, model, schedule)
         return model
 
 
@@ -104,7 +106,6 @@ def _card(
         "people": sum(people.variants[index] for index in chosen),
         "held_out_geometries": len(held),
         "full_density": people.full_density,
-        "schedule": config.schedule,
         "seed": config.seed,
         "device": "CPU" if task.device.type == "cpu" else device_info(task.device)["device_name"],
         **versions(),

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from primdiffusion.diffusion.codec import WholeSlab
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.samplers import gaussian_noise
-from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.files.picture_files import write_png
 from primdiffusion.formats import requests
@@ -110,8 +110,7 @@ class SlabTask(DiffusionTask):
         device: torch.device,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.schedule = SCHEDULES[str(config.schedule)]()
-        self.chain = CHAINS[str(config.chain)]
+        self.schedule = linear()
         self.config, self.people, self.held, self.device = config.slab, people, held[:MEASURED], device
         self.places = [(index, number) for index in train for number in range(people.variants[index])]
         self.denoiser: nn.Module = SlabUNet(config.unet).to(device)
@@ -158,7 +157,7 @@ class SlabTask(DiffusionTask):
     def model(self) -> DiffusionModel:
         """Return the model without a card; body shapes are not modelled."""
         density = self.people.full_density
-        return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, density, {}, chain=self.chain)
+        return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, density, {})
 
     def _guess(self, x: Float[Tensor, "b 56 256 256"], t: Tensor) -> Float[Tensor, "b 56 256 256"]:
         fast = self.config.bfloat16 and has_fast_bfloat16(x.device)

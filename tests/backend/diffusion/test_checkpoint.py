@@ -10,7 +10,7 @@ from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample, unfollowed, warnings_of
 from primdiffusion.diffusion.pretrained import model_card, save_pretrained
-from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
+from primdiffusion.diffusion.schedule import early_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.editing.vary import vary
 from primdiffusion.files.regular_files import FileError
@@ -52,8 +52,8 @@ def test_a_saved_model_generates_the_same_people(path):
 
 def test_the_steps_that_a_model_is_sampled_in_are_part_of_it(path):
     assert load_checkpoint(path).chain is trailing_steps
-    save_checkpoint(path, dataclasses.replace(small_model(), chain=dense_steps), "linear")
-    assert load_checkpoint(path).chain is dense_steps
+    save_checkpoint(path, dataclasses.replace(small_model(), chain=early_steps), "linear")
+    assert load_checkpoint(path).chain is early_steps
     rewrite(path, change_metadata=lambda m: {**m, "architecture": without(m["architecture"], "chain")})
     assert load_checkpoint(path).chain is trailing_steps
 

@@ -6,8 +6,8 @@ from primdiffusion.diffusion.samplers import RELEASED_END, ddim, ddpm, dpmpp_2m,
 from primdiffusion.diffusion.schedule import (
     CLEAN,
     Schedule,
-    leading_steps,
     linear,
+    released_steps,
     sqrt_linear,
     trailing_steps,
 )
@@ -80,13 +80,13 @@ def test_ddpm_is_that_of_diffusers(schedule, steps):
 def test_ddim_is_that_of_diffusers(schedule, eta):
     settings = {"clip_sample": False, "timestep_spacing": "leading", "steps_offset": 1}
     expected, chain = theirs(DDIMScheduler, schedule, start(), 100, 3, {"eta": eta}, **settings)
-    assert chain == leading_steps(1000, 100)
+    assert chain == released_steps(1000, 100)
     ours = last(ddim(of_mixture(schedule), schedule, start(), chain, torch.Generator().manual_seed(3), eta))
     assert (ours.x - expected).abs().max() < 1e-5
 
 
 @both_schedules
-@pytest.mark.parametrize(("steps", "chain"), [(100, leading_steps(1000, 100)), (1000, list(range(999, -1, -1)))])
+@pytest.mark.parametrize(("steps", "chain"), [(100, released_steps(1000, 100)), (1000, list(range(999, -1, -1)))])
 def test_ddim_that_ends_at_the_released_level_is_that_of_diffusers_without_a_clean_end(schedule, steps, chain):
     settings = {"clip_sample": False, "timestep_spacing": "leading", "steps_offset": int(steps < 1000)}
     settings |= {"set_alpha_to_one": False}

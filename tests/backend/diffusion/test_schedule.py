@@ -7,11 +7,10 @@ from diffusers import DDPMScheduler
 from primdiffusion.diffusion.schedule import (
     CLEAN,
     Schedule,
-    dense_steps,
     early_steps,
     fine_linear,
-    leading_steps,
     linear,
+    released_steps,
     sqrt_linear,
     trailing_steps,
 )
@@ -45,26 +44,12 @@ def test_one_step_posterior_follows_from_bayes_rule():
     assert schedule.posterior_std(t, t - 1) == pytest.approx(precision**-0.5, abs=1e-12)
 
 
-def test_trailing_steps_begin_at_the_end_and_leading_steps_are_the_released_ones():
+def test_trailing_steps_begin_at_the_end_and_released_ones_end_before_the_first():
     assert trailing_steps(1000, 4) == [999, 749, 499, 249]
-    assert leading_steps(1000, 100)[:2] == [991, 981]
-    assert leading_steps(1000, 100)[-1] == 1
+    assert released_steps(1000, 100)[:2] == [991, 981]
+    assert released_steps(1000, 100)[-1] == 1
     assert trailing_steps(1000, 1000) == list(range(999, -1, -1))
     assert np.all(np.diff(trailing_steps(1000, 30)) < 0)
-
-
-@pytest.mark.parametrize("steps", [1, 2, 7, 30, 100, 997, 1000])
-def test_dense_steps_fall_from_the_end_and_lie_closer_the_lower(steps):
-    chain = dense_steps(1000, steps)
-    assert len(chain) == steps
-    assert chain[0] == 999
-    gaps = -np.diff(chain)
-    assert (gaps > 0).all()
-    assert chain[-1] >= 0
-    if steps == 30:
-        assert chain[-1] == 0
-        assert sum(t < 20 for t in chain) >= 5 > sum(t < 20 for t in trailing_steps(1000, 30))
-        assert gaps[0] > 10 * gaps[-1]
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 30, 100, 950, 1000])
@@ -90,8 +75,6 @@ def test_impossible_numbers_of_steps_are_rejected(steps):
     with refused(ValueError, str(steps)):
         trailing_steps(1000, steps)
     with refused(ValueError, str(steps)):
-        dense_steps(1000, steps)
-    with refused(ValueError, str(steps)):
         early_steps(1000, steps)
 
 
@@ -116,8 +99,3 @@ def test_half_log_snr_is_the_logarithm_of_signal_over_noise(schedule):
 
 def test_half_log_snr_without_a_signal_is_minus_infinite():
     assert Schedule(torch.tensor([0.5, 0.0], dtype=torch.float64)).half_log_snr(1) == -math.inf
-
-
-def test_betas_outside_their_range_are_rejected():
-    with refused(ValueError, "beta"):
-        linear(last=1.5)
