@@ -1,4 +1,4 @@
-"""The whole pipeline on one page: generate a human, pose it, render it.
+"""The whole pipeline on one page: generate a human, pose it, frame it for `render.march.march`.
 
     model = load_checkpoint()                          # diffusion: noise -> payload and betas
     human = generate(model, seed=7)
@@ -33,11 +33,9 @@ from primdiffusion.geometry.rotation import polar
 from primdiffusion.primitives.anchors import Anchors, attach, default_anchors, stretched
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.render.march import MarchSettings, Rendering, march
 from primdiffusion.runtime.device import on_fixed_threads
 from primdiffusion.version import __version__
 
-DEFAULT_SETTINGS = MarchSettings()
 VERTICAL_FOV = math.radians(30)
 LARGEST_PICTURE = 8192
 """Pixels per side; a limit that keeps a mistyped size from exhausting memory."""
@@ -313,10 +311,3 @@ def framing(primitives: Primitives, yaw_degrees: float = 0.0, width: int = 512, 
     needed = torch.maximum(offset[:, 1].abs() / slope, (offset @ right).abs() / (slope * width / height))
     distance = FRAMING_MARGIN * float((needed + offset @ towards_camera).amax())
     return look_at(middle + distance * towards_camera, middle, vertical_fov=VERTICAL_FOV, width=width, height=height)
-
-
-def render(
-    human: Human, camera: Camera, pose: BodyPose | None = None, settings: MarchSettings = DEFAULT_SETTINGS
-) -> Rendering:
-    """Render the human in a pose (None: T pose)."""
-    return march(place(human, pose), camera, settings)

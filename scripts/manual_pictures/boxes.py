@@ -14,7 +14,8 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.image import encode_srgb
-from primdiffusion.human import Human, generate, render
+from primdiffusion.human import Human, generate, place
+from primdiffusion.render.march import march
 
 from .shrink import save_jpeg
 
@@ -36,5 +37,5 @@ def boxes(out: Path) -> None:
 def _torso(human: Human) -> np.ndarray:
     eye, target = torch.tensor([0.8, 0.1, 1.5]), torch.tensor([0.0, 0.1, 0.0])
     camera = look_at(eye, target, vertical_fov=math.radians(32), width=SIZE, height=SIZE)
-    colours = encode_srgb(render(human, camera).over(_GREY).clamp(0, 1))
+    colours = encode_srgb(march(place(human), camera).over(_GREY).clamp(0, 1))
     return (colours * 255).round().byte().numpy()

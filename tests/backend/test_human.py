@@ -6,9 +6,10 @@ import math
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, default_body, measure
-from primdiffusion.human import Human, framing, generate, place, pose_body, render
+from primdiffusion.human import Human, framing, generate, place, pose_body
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
+from primdiffusion.render.march import march
 from support.errors import refused
 from support.tiny import FULL_DENSITY, tiny_model
 
@@ -136,7 +137,8 @@ def test_yaw_zero_looks_at_the_face_and_a_quarter_turn_at_the_persons_left(human
 
 
 def test_the_person_is_drawn_whole_and_opaque(human):
-    rendering = render(human, framing(place(human), width=64, height=64))
+    boxes = place(human)
+    rendering = march(boxes, framing(boxes, width=64, height=64))
     assert 0.1 < (rendering.alpha > 0.5).float().mean() < 0.5
     assert rendering.alpha[:, 32].max() > 0.99
     colour = rendering.rgb[rendering.alpha > 0.99].mean(0)
