@@ -156,8 +156,8 @@ class ExportGaussiansJob(Job):
         return f"Export {self.target.name} to {self.path.name}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        pose = {name: self.person[name] for name in ("object", "joints", "betas")}
-        return {"person": self.target.file_now(), **pose, "limit": self.limit, "out": str(folder / "gaussians.ply")}
+        person = {**self.person, "human": self.target.file_now()}
+        return {"person": person, "limit": self.limit, "out": str(folder / "gaussians.ply")}
 
     def finish(self, _context: bpy.types.Context, result: GaussiansAnswer, _folder: Path) -> str:
         put(result.out, self.path)

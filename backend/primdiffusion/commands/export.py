@@ -32,7 +32,7 @@ def proxy(request: ProxyRequest, session: Session, report: ReportProgress) -> Pr
     began = time.perf_counter()
     with atomic_folder(request.out_dir) as folder:
         report("load", 0, 4, None)
-        human = _shaped(request.person, request.betas)
+        human = _shaped(load_human(request.person), request.betas)
         made = mesh_proxy(human, request, lambda stage, done, total: report(stage, done, total + 1, None))
         report("write", 3, 4, 0.0)
         write_proxy_arrays(folder, made)
@@ -50,24 +50,13 @@ def gaussians(request: GaussiansRequest, session: Session, report: ReportProgres
     """Raises OSError, and as load_human."""
     began = time.perf_counter()
     report("load", 0, 2, None)
-    human = _shaped(request.person, request.betas)
-    if request.object is None or request.joints is None:
-        primitives = place_on_floor(human)
-    else:
-        joints, matrix = (torch.tensor(numbers, dtype=torch.float32) for numbers in (request.joints, request.object))
-        primitives = place_skinned(human, joints, matrix)
+    primitives = _placed(load_human(request.person.human), request.person)
     report("gaussians", 1, 2, None)
     splats = gaussians_of(primitives, request.limit)
     report("write", 2, 2, 0.0)
     write_gaussians(request.out, splats)
     seconds = round(time.perf_counter() - began, 3)
     return GaussiansAnswer(out=request.out, gaussians=len(splats.opacity), seconds=seconds)
-
-
-def _shaped(person: Path, betas: list[float] | None) -> Human:
-    """Load a human, with other betas if given. Raises ValueError for a wrong number of them, and as load_human."""
-    human = load_human(person)
-    return human if betas is None else reshaped(human, torch.tensor(betas, dtype=torch.float32))
 
 
 def export(command: ExportCommand, session: Session, report: ReportProgress) -> Path:
@@ -109,7 +98,10 @@ def merge(request: MergeRequest, session: Session, report: ReportProgress) -> Me
 
 
 def _placed(human: Human, person: PosedPerson) -> Primitives:
-    if person.betas is not None:
-        human = reshaped(human, torch.tensor(person.betas, dtype=torch.float32))
     joints, matrix = (torch.tensor(numbers, dtype=torch.float32) for numbers in (person.joints, person.object))
-    return place_skinned(human, joints, matrix)
+    return place_skinned(_shaped(human, person.betas), joints, matrix)
+
+
+def _shaped(human: Human, betas: list[float] | None) -> Human:
+    """The human with other betas if given. Raises ValueError for a wrong number of them."""
+    return human if betas is None else reshaped(human, torch.tensor(betas, dtype=torch.float32))

@@ -483,23 +483,12 @@ class ProxyRequest(ProxySettings):
 class GaussiansRequest:
     """Write a human as 3D Gaussians, posed by an armature."""
 
-    person: Path
-    """A .human.safetensors file."""
+    person: PosedPerson
+    """The human and its pose."""
     out: Annotated[Path, Ending((".ply",))]
     """Output .ply."""
-    object: Matrix | None = None
-    """[3][4] world matrix of the armature object; y up, metres. Without it and `joints`: the T pose at the origin."""
-    joints: JointMatrices | None = None
-    """[24][3][4] rest to posed in object space, SMPL's joint order."""
-    betas: list[float] | None = None
-    """Shape coefficients; None for those of the file."""
     limit: Annotated[int, Range(1)] = 400_000
     """Largest number of Gaussians; about 130,000 of a human are visible."""
-
-    def check(self) -> None:
-        """Raise FieldError for one of object and joints without the other."""
-        if (self.object is None) != (self.joints is None):
-            raise FieldError(("object",), "and joints go together: give both, or neither for the T pose")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

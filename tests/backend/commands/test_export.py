@@ -8,7 +8,7 @@ from export_people import person
 from primdiffusion import cli
 from primdiffusion.commands.export import gaussians, proxy
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import GaussiansRequest, ProxyRequest
+from primdiffusion.formats.requests import GaussiansRequest, PosedPerson, ProxyRequest
 from primdiffusion.human import place, pose_body
 from primdiffusion.human_file import save_human
 
@@ -74,7 +74,7 @@ def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
 def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):
     skinning = pose_body(person().betas).skinning[:, :3].tolist()
     moved = [[1.0, 0, 0, 2.0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
-    request = GaussiansRequest(person=saved, out=tmp_path / "p.ply", object=moved, joints=skinning, limit=2000)
+    request = GaussiansRequest(person=PosedPerson(saved, moved, skinning), out=tmp_path / "p.ply", limit=2000)
     assert gaussians(request, Session(), silent).gaussians == 2000
     assert splatter.read_ply(tmp_path / "p.ply")["x"].mean() == pytest.approx(2.0, abs=0.1)
 

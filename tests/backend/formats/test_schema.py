@@ -183,7 +183,7 @@ GIVEN = {
 
 
 OTHERWISE = {
-    "gaussians": {"out": "a.ply"},
+    "gaussians": {"out": "a.ply", "person": {"human": "h", "object": STILL, "joints": [STILL] * 24}},
     "reconstruct": {"capture": "a"},
     "fit_posture": {"pictures": ["a"]},
     "inpaint": {"region": ["top"]},
@@ -242,7 +242,7 @@ def test_a_regions_corner_is_counted_from_the_top():
         ("fit_posture", {"pictures": []}, "pictures"),
         ("merge", {"people": []}, "people"),
         ("merge", {"voxel": 0.0}, "voxel"),
-        ("gaussians", {"object": STILL}, "object"),
+        ("gaussians", {"person": {"human": "h", "object": STILL}}, "person.joints"),
     ],
 )
 def test_wrong_values_are_named_in_one_sentence(method, changes, field):

@@ -142,8 +142,8 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
     assert [path.name for path in out.iterdir()] == ["a.ply"], "without an extension it is the panel's format"
     asked = json.loads((out / "a.ply").read_text())
     assert asked["limit"] == 1234
-    assert np.array(asked["object"])[0, 3] == pytest.approx(3.0)
-    assert np.array(asked["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
+    assert np.array(asked["person"]["object"])[0, 3] == pytest.approx(3.0)
+    assert np.array(asked["person"]["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
 
 
 def test_a_human_file_goes_out_and_comes_back_with_its_shape(anna, store, out):
