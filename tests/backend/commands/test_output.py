@@ -141,6 +141,7 @@ def test_every_edit_shows_its_guesses(checkpoint, tmp_path, always):
         listener = Listener()
         edit(request, session, listener)
         assert len(listener.pictures) >= 2, method
+        assert [stage for stage in listener.stages if stage != "sample"] == ["load", "write", "write"], method
         assert sorted(path.name for path in tmp_path.joinpath(request.out_dir).iterdir()) == FILES, method
 
 
