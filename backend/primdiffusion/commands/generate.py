@@ -145,10 +145,10 @@ def _sample_variations(
         left = pace.left(done, step.total)
         report("sample", done, step.total, left)
         for _ in seeds:
-            if done == step.total or not budget.granted():
+            if done == step.total or not budget.allows():
                 return
             index = next(turns)
-            with budget.spending():
+            with budget.measure():
                 path = previews.next()
                 draw_front_and_back(path, decode(step.x0[index : index + 1], seeds[index]), request.size)
             report("sample", done, step.total, left, picture=path, index=index)

@@ -139,14 +139,14 @@ class PreviewBudget:
         self._spent, self._cost = 0.0, 0.0
         self._drawn = 0
 
-    def granted(self) -> bool:
+    def allows(self) -> bool:
         """Return whether a preview that takes as long as the last one may be drawn now."""
         now = time.perf_counter()
         affordable = self._spent + self._cost <= TIME_SHARE * (now - self._began + self._cost)
         return now - self._last >= self._interval_s and affordable
 
     @contextlib.contextmanager
-    def spending(self) -> Iterator[None]:
+    def measure(self) -> Iterator[None]:
         """Measure the drawing of a preview, except of the first, which loads and compiles the marcher."""
         began = time.perf_counter()
         yield
@@ -196,9 +196,9 @@ def step_previews(
     budget = PreviewBudget()
 
     def preview(step: SamplerStep) -> Path | None:
-        if step.index + 1 == step.total or not budget.granted() or skips_previews(px):  # the result follows the last
+        if step.index + 1 == step.total or not budget.allows() or skips_previews(px):  # the result follows the last
             return None
-        with budget.spending():
+        with budget.measure():
             human = decode(step.x0)
             if human is None:
                 return None
@@ -219,7 +219,7 @@ def draw(
     """
     if compositing == "released":
         rendering = render_srgb(primitives, camera)
-        rgba_to_png(path, decoded(rendering, background), background)
+        rgba_to_png(path, to_linear_rgba(rendering, background), background)
     else:
         rendering = march(primitives, camera)
         rendering.save(path, background)
@@ -231,7 +231,7 @@ def render_srgb(primitives: Primitives, camera: Camera) -> Rendering:
     return march(dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb)), camera, RELEASED)
 
 
-def decoded(rendering: Rendering, background: Background | None) -> Float[Tensor, "h w 4"]:
+def to_linear_rgba(rendering: Rendering, background: Background | None) -> Float[Tensor, "h w 4"]:
     """Linear premultiplied RGB and alpha of sRGB-encoded colours, put over the background (linear RGB) while encoded.
 
     Over a background the result is opaque.

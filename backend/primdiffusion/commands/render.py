@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, default_body, pose_from_numbers, read_pose
-from primdiffusion.commands.output import decoded, render_srgb
+from primdiffusion.commands.output import render_srgb, to_linear_rgba
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.drawing import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
@@ -230,7 +230,7 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     camera, background = framing(primitives, request.yaw_degrees, width, height), BACKGROUNDS[request.background]
     report("render", 0, 1, None)
     if request.compositing == "released":
-        rgba = decoded(render_srgb(primitives, camera), background)
+        rgba = to_linear_rgba(render_srgb(primitives, camera), background)
     else:
         scene = Scene(primitives, chart=body_of(human)[1].chart)
         look = ViewSettings(request.view, settings=MarchSettings(step=request.step))

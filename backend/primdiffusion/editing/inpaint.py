@@ -110,7 +110,7 @@ MaskedSampler = Callable[
     [Denoise, Schedule, Tensor, Tensor, Tensor, Sequence[int], torch.Generator], Iterator[SamplerStep]
 ]
 DRAWS = 64
-"""Of the person prior, to start from."""
+"""Draws of the person prior to choose a start from."""
 MASKED_SAMPLERS: Mapping[requests.InpaintMethod, MaskedSampler] = {"repaint": repaint, "released": paste_after_steps}
 """Samplers of a region by name."""
 

@@ -33,7 +33,7 @@ _UNREADABLE = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError,
     RuntimeError, ValueError, TypeError, OverflowError, LookupError,
 )  # fmt: skip
-"""What zipfile and numpy raise for damaged files."""
+"""Exceptions of zipfile and numpy for damaged files."""
 
 
 def array_names(path: str | Path) -> list[str]:

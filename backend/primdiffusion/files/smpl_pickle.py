@@ -35,7 +35,7 @@ MAX_NESTING = 8
 _DAMAGED = (
     pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError, zlib.error,
 )  # fmt: skip
-"""What the unpickler raises where operations do not fit their values."""
+"""Exceptions of the unpickler where operations do not fit their values."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
 _TYPE_SIZE = re.compile(r"[biufcSU](\d{1,6})")
 

@@ -20,7 +20,7 @@ COMPACT_SCALES = "compact"
 """Metadata of compact files: JSON, the linear colour and the density (1/m) that are stored as 255."""
 _LEVELS = 255
 LARGEST_VALUE = 65504.0
-"""Of colours, densities and sizes of boxes: larger ones overflow in half precision."""
+"""Largest colour, density and size of a box: larger ones overflow in half precision."""
 _KNEE = 12.92 * 0.0031308
 
 

@@ -103,7 +103,7 @@ class NetworkTraining(OptimiserSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunSettings(Checked):
-    """Where a run is, and how it is stopped, measured and saved: the same for every task."""
+    """Place of a run, and how it is stopped, measured and saved: the same for every task."""
 
     data: Path
     """Training set."""
@@ -123,7 +123,7 @@ class RunSettings(Checked):
     pictures_every: Count = 1000
     """Steps between images made with the averaged weights."""
     tracker: Tracker | None = None
-    """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
+    """Tracker of metrics besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

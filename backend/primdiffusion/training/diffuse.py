@@ -28,7 +28,7 @@ from primdiffusion.version import __version__
 
 MODEL = "model.safetensors"
 CLOSED_FORM = ("closed_form_geometries", "closed_form_people")
-"""What a card says of the people of a closed form that is not that of the training data."""
+"""Entries of a card on the people of a closed form that is not that of the training data."""
 DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fitted to renders of their meshes"
 LIMITS = (
     "The humans are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "

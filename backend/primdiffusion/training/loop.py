@@ -68,12 +68,12 @@ class StepMetrics:
 
 
 class Task(ABC):
-    """What is trained: a network."""
+    """Training of one network."""
 
     name: str
     """Name of the network, before its settings on the command line; "" where they stand alone."""
     smaller: str
-    """What to try if a batch of 1 does not fit into memory."""
+    """Advice for a batch of 1 that does not fit into memory."""
 
     @property
     @abstractmethod

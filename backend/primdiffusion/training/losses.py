@@ -26,8 +26,8 @@ from primdiffusion.training.latents import LatentSet
 LEVELS = (50, 100, 300, 500, 700, 900)
 """Steps at which held-out error is reported."""
 LEVEL_MEDIAN, LEVEL_WIDTH = 2.0, 1.4
-"""Of log-normal levels: median of noise over signal, in units of the samples' standard deviation, and standard
-deviation of its logarithm."""
+"""Median of noise over signal at log-normal levels, in units of the samples' standard deviation, and standard deviation
+of its logarithm."""
 LOG_UNIFORM_SHARE = 0.2
 """Share of log-uniform levels among log-normal ones: no level stays untrained."""
 

@@ -24,7 +24,7 @@ from primdiffusion.training.regression import RIDGE, principal_directions, regre
 PASSES = 4
 """Rounds of backfitting."""
 SAME_GARMENTS = 0.5
-"""What a person of another group in the same garments counts for a group's covariance."""
+"""Weight of a person of another group in the same garments in a group's covariance."""
 GROUP_COLOURS = 4
 """Principal directions of a group in which its colours differ."""
 

@@ -48,7 +48,7 @@ def clock(monkeypatch):
 def always(monkeypatch):
     """Every step gets its picture."""
     monkeypatch.setattr(output, "INTERVAL_S", 0.0)
-    monkeypatch.setattr(PreviewBudget, "granted", lambda _: True)
+    monkeypatch.setattr(PreviewBudget, "allows", lambda _: True)
 
 
 class Listener:
@@ -68,9 +68,9 @@ def test_pictures_come_no_more_often_than_the_interval_and_take_a_quarter_of_the
     budget, times, spent = PreviewBudget(0.4), [], 0.0
     for _ in range(300):
         clock.now += 0.05
-        if budget.granted():
+        if budget.allows():
             times.append(clock.now)
-            with budget.spending():
+            with budget.measure():
                 clock.now += 0.3
             spent += 0.3
     gaps = [later - earlier - 0.3 for earlier, later in itertools.pairwise(times)]
@@ -82,9 +82,9 @@ def test_quick_pictures_come_at_the_interval(clock):
     budget, drawn = PreviewBudget(0.5), 0
     for _ in range(100):
         clock.now += 1 / 8
-        if budget.granted():
+        if budget.allows():
             drawn += 1
-            with budget.spending():
+            with budget.measure():
                 clock.now += 1 / 1024
     assert drawn == 25
 

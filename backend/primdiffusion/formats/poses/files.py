@@ -60,7 +60,7 @@ POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *RATES)
 _HOLDING = (*_POSES, *_REST)
 """Arrays of which a person has at least one."""
 ENDINGS = (".npz", ".npy", ".json", ".pkl", ".bvh")
-"""Of the files that are read."""
+"""Endings of the files that are read."""
 UP_AXES = ("", "x", "-x", "y", "-y", "z", "-z")
 """Axes that may point up in a file; the empty one stands for detection."""
 _BODIES = {24: "SMPL", 22: "SMPL without hands", 52: "SMPL-H", 55: "SMPL-X"}
