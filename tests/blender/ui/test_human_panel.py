@@ -141,14 +141,15 @@ def test_the_panel_shows_provenance(person, addon):
     person[MARK] = json.dumps(
         {
             **json.loads(person[MARK]),
+            "sampler": "ddim",
             "edits": [{"edit": "vary", "amount": 0.5}],
             "attributes": {"sex": "female", "hair": "bald"},
             "unfollowed": {"hair": "long"},
         }
     )
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
-    made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
-    for text in made:
+    made = ("Seed: 0", "Steps: 5", "Sampler: DDIM", "Sex: female", "Not followed: hair (shows long)")
+    for text in (*made, "Edit: vary", "amount 0.5"):
         assert text in details
 
 
