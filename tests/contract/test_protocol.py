@@ -1,5 +1,6 @@
 """The child as the protocol promises it to anyone: lines in, lines out."""
 
+import json
 import subprocess
 import sys
 
@@ -153,13 +154,15 @@ def test_render_draws_a_saved_person_in_a_pose(child, checkpoint, tmp_path):
             assert image.size == (96, 64)
             return np.asarray(image).astype(float)
 
-    raised = [[0.0, 0.0, 0.0]] * 24
-    raised[16] = [0.0, 0.0, 1.2]
-    rest, posed, turned = picture(91, "r.png"), picture(92, "p.png", pose=raised), picture(93, "t.png", yaw_degrees=90)
+    raised, wrong = tmp_path / "raised.json", tmp_path / "wrong.json"
+    raised.write_text(json.dumps([[0.0, 0.0, 0.0]] * 16 + [[0.0, 0.0, 1.2]] + [[0.0, 0.0, 0.0]] * 7))
+    wrong.write_text("[1, 2]")
+    rest, posed = picture(91, "r.png"), picture(92, "p.png", pose=str(raised))
+    turned = picture(93, "t.png", yaw_degrees=90)
     assert np.abs(rest - posed).mean() > 1
     width = [(image.sum((0, 2)) > 0).sum() for image in (rest, turned)]
     assert width[1] < 0.5 * width[0], "from the side a T pose is narrow"
-    error = child.ask(94, "render", human=person["person"], out=str(tmp_path / "x.png"), pose=[1, 2])["error"]
+    error = child.ask(94, "render", human=person["person"], out=str(tmp_path / "x.png"), pose=str(wrong))["error"]
     assert error["code"] == DOMAIN_ERROR
     assert "72" in error["message"]
     assert not (tmp_path / "x.png").exists()

@@ -7,7 +7,7 @@ import functools
 import importlib.resources
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -329,11 +329,6 @@ def read_pose(path: str | Path, frame: int = 0, person: str = "") -> BodyPose:
     Raises FileNotFoundError and ValueError.
     """
     return _frame(read_motion(path, person), str(path), frame)
-
-
-def pose_from_numbers(content: Any, name: str) -> BodyPose:
-    """Parse a list, or a mapping with "pose" and "translation"; errors call it `name`. Raises ValueError."""
-    return _frame(_as_pose(files.motion_from_numbers(content, name)), name, 0)
 
 
 def _as_pose(motion: Motion) -> BodyPose:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from primdiffusion.body.model import BodyModel, default_body, pose_from_numbers, read_pose
+from primdiffusion.body.model import BodyModel, default_body, read_pose
 from primdiffusion.commands.output import render_srgb, to_linear_rgba
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
@@ -220,11 +220,8 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     """Render, and return the path. Raises as load_human and read_pose, and OSError."""
     began = time.perf_counter()
     report("load", 0, 1, None)
-    human, pose, given = load_human(request.human), None, request.pose
-    if isinstance(given, Path):
-        pose = read_pose(given, request.frame, request.tracked_person)
-    elif given is not None:
-        pose = pose_from_numbers(given, "the parameter pose")
+    human = load_human(request.human)
+    pose = None if request.pose is None else read_pose(request.pose, request.frame, request.tracked_person)
     primitives = place(human, pose)
     width, height = (request.size if side is None else side for side in (request.width, request.height))
     camera, background = framing(primitives, request.yaw_degrees, width, height), BACKGROUNDS[request.background]

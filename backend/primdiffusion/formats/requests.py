@@ -343,9 +343,6 @@ class RenderRequest(PoseOptions):
     """A .human.safetensors file."""
     out: Annotated[Path, Ending((".png",))]
     """Output PNG."""
-    pose: Path | list | None = None
-    """72 axis-angle numbers (24 x 3, radians), or a pose file with them (.npz, .npy, .json, .pkl, .bvh); default: T
-    pose."""
     yaw_degrees: Annotated[float, Range(-1e30, 1e30), Option(name="yaw")] = 0.0
     """Camera position around the human, degrees: 0 in front, 90 at the human's left."""
     size: Pixels = 512

@@ -15,7 +15,6 @@ from primdiffusion.body.model import (
     betas_of_measures,
     default_body,
     measure,
-    pose_from_numbers,
     read_pose,
 )
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -311,9 +310,11 @@ def test_a_translation_comes_along(tmp_path):
 @pytest.mark.parametrize(
     "content", [[1, 2, 3], {"theta": None}, {"pose": "up"}, {}, [[0, 0, 0]] * 23, [math.nan] * 72, None, {"pose": []}]
 )
-def test_numbers_that_are_no_pose_are_rejected_by_name(content):
+def test_numbers_that_are_no_pose_are_rejected_by_name(content, tmp_path):
+    path = tmp_path / "my pose.json"
+    path.write_text(json.dumps(content))
     with refused(ValueError, "my pose"):
-        pose_from_numbers(content, "my pose")
+        read_pose(path)
 
 
 def test_a_frame_beyond_the_end_is_rejected(tmp_path):

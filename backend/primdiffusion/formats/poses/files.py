@@ -121,17 +121,12 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
-    """The motion of a file's arrays, named as in `POSE_KEYS`, axes unchanged. Raises FileError, and OSError."""
-    check_motion_size(path, max((array.size for array in arrays.values()), default=0))
-    return motion_from_numbers(arrays, str(path))
+    """The motion of a file's arrays, named as in `POSE_KEYS`, axes unchanged.
 
-
-def motion_from_numbers(content: Any, name: str) -> Motion:
-    """The motion of arrays by their usual names, or of lists as in JSON, axes unchanged; errors call it `name`.
-
-    Raises FileError where it holds no poses.
+    Raises FileError, also where they hold no poses, and OSError.
     """
-    arrays = _arrays(content, name)
+    name = str(path)
+    check_motion_size(path, max((array.size for array in arrays.values()), default=0))
     if not _holds_smpl(arrays):
         raise FileError(name, "holds no poses", "give 'pose', or 'global_orient' and 'body_pose'")
     check_numbers(arrays, name)
