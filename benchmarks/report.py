@@ -50,7 +50,7 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("a person cut out by the body posed over it: overlap", "spoiled_pictures", "cutout_iou", ""),
     ),
     "Generated humans": (
-        ("a human, 30 steps", "diffusion", "generate_seconds_cpu", "s"),
+        ("a human, 20 steps", "diffusion", "generate_seconds_cpu", "s"),
         ("memory", "diffusion", "peak_gb", "GB"),
         ("Frechet distance to meshes of other people", "diffusion", "distance_ours", ""),
         ("the same of other meshes, the floor", "diffusion", "distance_floor", ""),

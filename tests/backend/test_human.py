@@ -36,7 +36,7 @@ def test_a_seed_is_a_person(human):
 def test_a_person_knows_where_it_comes_from(human):
     assert human.provenance["seed"] == 3
     assert human.provenance["steps"] == 5
-    assert human.provenance["sampler"] == "ddim"
+    assert human.provenance["sampler"] == "dpmpp_2m"
     assert human.provenance["checkpoint"] == "tiny"
     assert human.provenance["full_density"] == FULL_DENSITY
 

@@ -374,7 +374,7 @@ def restore_surfaces(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabul
     if not tensors:
         return None
     whole = {name: tensors[name].long() for name in ("surface", "cell", "garment", "printed", "box")}
-    flags = {name: tensors[name].bool() for name in ("read", "drawn")}
+    flags = {name: tensors[name].bool() for name in ("natural", "read", "drawn")}
     of_voxels = {name: tensors[name].float() / BYTE * most for name, most in _OF_VOXELS.items()}
     surfaces = Surfaces(**{**tensors, **whole, **flags, **of_voxels})
     check_surfaces(surfaces, vocabulary)

@@ -216,7 +216,7 @@ def sample(
     guidance: float = requests.Conditioning.guidance,
     end: int = CLEAN,
 ) -> Iterator[SamplerStep]:
-    """Generate a person for each seed, yielding every step; the last step's x is the result (default: 30 DDIM steps).
+    """Generate a person for each seed, yielding every step; the last step's x is the result (default: DPM-Solver++).
 
     The same batch of seeds gives the same bits on one kind of device with one version of torch, on any number of cores.
     A seed's noise is the same in any batch and on any device, so the person is the same up to rounding. Categories that
@@ -296,7 +296,7 @@ def check_surfaces(surfaces: Surfaces, vocabulary: AttributeVocabulary) -> None:
     check_shapes(surfaces)
     if surfaces.condition.shape[1] != vocabulary.width:
         raise ValueError(f"surfaces are described by {surfaces.condition.shape[1]} values, not {vocabulary.width}")
-    kinds, prints, boxes = len(surfaces.condition), len(surfaces.print_condition), len(surfaces.cell)
+    kinds, prints, boxes = len(surfaces.condition), len(surfaces.garment), len(surfaces.cell)
     limits = {"surface": kinds, "cell": K, "garment": kinds, "printed": prints, "box": boxes}
     for name, count in limits.items():
         numbers = getattr(surfaces, name)

@@ -12,7 +12,6 @@ garment on everybody who has it, in two colours (`training.prints`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -26,6 +25,8 @@ SURELY = 0.75
 """Share of a surface above which a voxel counts for the surface's colour."""
 BRIGHTEST = 2.0
 """Largest tone."""
+BLACK = 0.1
+"""sRGB-encoded colour of what is black: folds would not show in less."""
 DIMMEST = 0.3
 """Darker voxels say little of a garment's colours."""
 EVEN, MOST_BOXES = 0.04, 0.75
@@ -36,10 +37,12 @@ EXPLAINED = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Surfaces(TensorRecord):
-    """L surfaces in N boxes, of which later ones cover earlier ones, and Q prints in M of these boxes."""
+    """L surfaces in N boxes, of which later ones cover earlier ones, and Q prints on M of these boxes."""
 
     condition: Float[Tensor, "l x"]
     """What all people who have the surface are like: 1 at their values (`AttributeVocabulary.encode`)."""
+    natural: Bool[Tensor, "l"]
+    """Hair and skin, in which there is no more green than red, and no more blue than green."""
     surface: Int[Tensor, "n"]
     """The surface that the box shows."""
     cell: Int[Tensor, "n"]
@@ -51,11 +54,9 @@ class Surfaces(TensorRecord):
     read: Bool[Tensor, "n"]
     """Whether the surface's colour is read here."""
     drawn: Bool[Tensor, "n"]
-    """Whether it is drawn here; faces keep their own colours."""
-    print_condition: Float[Tensor, "q x"]
-    """What all people who have the print, or another one on the same garment, are like."""
+    """Whether it is drawn here; faces keep their own colours, and patterned garments, except in a print."""
     garment: Int[Tensor, "q"]
-    """The surface whose boxes and tones the print has; its other boxes have the first colour."""
+    """The surface that the print is on; its other boxes have the first colour."""
     printed: Int[Tensor, "m"]
     """The print that the box shows."""
     box: Int[Tensor, "m"]
@@ -64,55 +65,63 @@ class Surfaces(TensorRecord):
     """How much of a voxel's colour is the second one, 0 ... 1."""
 
     def recolour(self, cells: Float[Tensor, "b k v"], kind: Float[Tensor, "b x"]) -> Float[Tensor, "b k v"]:
-        """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour, and
-        each of their prints in two."""
+        """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour, or
+        in the two of a print."""
         recoloured = cells.clone()
-        having, printed = (_fitting(kind, condition) for condition in (self.condition, self.print_condition))
-        for person, its in enumerate(having):
+        for person, its in enumerate(_fitting(kind, self.condition)):
             surfaces = its.nonzero()[:, 0].tolist()
             covered = cells.new_zeros(cells.shape[1], S**3)
             colours = {}
             for surface in reversed(surfaces):
                 own = self.surface == surface
-                colours[surface] = self._colour(cells[person], own & self.read, 1 - covered)
+                colour = self._colour(cells[person], own & self.read, 1 - covered)
+                colours[surface] = (colour.cummin(0).values if self.natural[surface] else colour).clamp_min(BLACK)
                 own &= self.drawn
                 covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
-            for garment in self.garment[printed[person]].unique().tolist():
-                boxes = ((self.surface == garment) & self.read & self.drawn).nonzero()[:, 0]
-                prints = (printed[person] & (self.garment == garment)).nonzero()[:, 0].tolist()
-                rgb = self._printed(cells[person], boxes, prints, 1 - covered)
-                recoloured[person, self.cell[boxes], : 3 * S**3] = rgb.mT.flatten(1)
             for surface in surfaces:
-                own = (self.surface == surface) & self.drawn
+                own = (self.surface == surface).nonzero()[:, 0]
+                drawn = self._printed(cells[person], own, (self.garment == surface).nonzero()[:, 0], 1 - covered)
+                if drawn is None:
+                    own = own[self.drawn[own]]
+                    drawn = self.tone[own][..., None] * colours[surface]
                 rgb = voxels_of(recoloured[person, self.cell[own]])[..., :3]
-                rgb = torch.lerp(rgb, self.tone[own][..., None] * colours[surface], self.share[own][..., None])
+                rgb = torch.lerp(rgb, drawn, self.share[own][..., None])
                 recoloured[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
         return recoloured
 
     def _printed(
-        self, cells: Float[Tensor, "k v"], boxes: Int[Tensor, "r"], prints: Sequence[int], bare: Float[Tensor, "k 512"]
-    ) -> Float[Tensor, "r 512 3"]:
-        """A garment's colours in one of these prints, as strong as they are; unchanged if prints do not explain them.
+        self,
+        cells: Float[Tensor, "k v"],
+        boxes: Int[Tensor, "r"],
+        prints: Int[Tensor, "q"],
+        bare: Float[Tensor, "k 512"],
+    ) -> Float[Tensor, "r 512 3"] | None:
+        """A garment's colours in one of these prints, as strong as they are; None if prints do not explain them.
 
         A sample is a mixture of prints: it gets the one whose two colours differ most.
         """
-        voxels, tone = voxels_of(cells[self.cell[boxes]]), self.tone[boxes]
-        weight = (seen(voxels) * bare[self.cell[boxes]] * (tone > DIMMEST)).flatten()
+        if not len(prints):
+            return None
+        read = self.read[boxes]
+        voxels, tone = voxels_of(cells[self.cell[boxes[read]]]), self.tone[boxes[read]]
+        weight = (seen(voxels) * bare[self.cell[boxes[read]]] * (tone > DIMMEST)).flatten()
         weight = weight / weight.sum().clamp_min(1e-6)
         untoned = (voxels[..., :3] / tone.clamp_min(DIMMEST)[..., None]).flatten(0, 1)
         mean = weight @ untoned
         variance = weight @ (untoned - mean).square().sum(1)
-        second = torch.stack([self._second(number)[boxes].flatten() for number in prints])
-        centred = second - (second @ weight)[:, None]
+        second = torch.stack([self._second(number)[boxes] for number in prints.tolist()])
+        centred = second[:, read].flatten(1)
+        average = centred @ weight
+        centred = centred - average[:, None]
         gram, by_colour = (centred * weight) @ centred.T, (centred * weight) @ untoned
         together = torch.linalg.solve(gram + 1e-4 * torch.eye(len(gram)).to(gram), by_colour)
         if (together * by_colour).sum() <= EXPLAINED * variance:
-            return voxels[..., :3]
+            return None
         best = together.square().sum(1).argmax()
         slope = by_colour[best] / gram[best, best].clamp_min(1e-6)
         strength = (variance / (gram[best, best] * slope.square().sum()).clamp_min(1e-6)).sqrt()
-        colours = mean + strength * centred[best][:, None] * slope
-        return (tone[..., None] * colours.view_as(voxels[..., :3])).clamp(0, 1)
+        colours = mean + strength * (second[best] - average[best])[..., None] * slope
+        return (self.tone[boxes][..., None] * colours).clamp(0, 1)
 
     def _second(self, number: int) -> Float[Tensor, "n 512"]:
         """How much of all voxels is a print's second colour."""

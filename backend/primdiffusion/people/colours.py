@@ -66,7 +66,7 @@ CLOTHES: dict[str, str] = {
 }
 SOBER = ("trousers", "tights", "skirt", "suit", "shoe", "sock", "hat")
 HAIR: dict[str, str] = {
-    "black": "14110f",
+    "black": "292523",
     "darkbrown": "2a1c14",
     "brown": "452d1e",
     "lightbrown": "6e4b30",

@@ -18,6 +18,7 @@ samples use the same cameras, for the same reason.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
@@ -26,8 +27,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
+from torch import Tensor
+from torch.nn import functional
 
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
@@ -51,7 +54,7 @@ from primdiffusion.runtime.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-METHOD = "fitted 2"
+METHOD = "fitted 3"
 """Method and version stored in files, followed by the checkpoint; those of others are made again."""
 GUESS_LEVEL = 100
 """Step at which the model denoises the mesh's own colours, to make the start of a fit."""
@@ -198,11 +201,21 @@ def fitted_payloads(
         raise ValueError("no mesh to fit to: give at least one colouring")
     field = surface_field(colourings[0], frames)
     starts = [colour(field, mesh) for mesh in colourings]
+    near = near_surface(starts[0])
     if model is not None:
         starts = [guess(model, start) for start in starts]
     targets = _targets(colourings, frames, betas, turn)
     fitted = fit_payload(starts[0], targets[0], FULL_DENSITY, settings)
+    fitted = dataclasses.replace(fitted, density=fitted.density * near)
     return fit_colours([fitted, *starts[1:]], fitted, targets, settings)
+
+
+def near_surface(payload: Payload) -> Bool[Tensor, "k 8 8 8"]:
+    """Voxels of a mesh's own payload that are dense, and their neighbours.
+
+    What a model guesses elsewhere, and pictures hardly see, is smoke beside long hair.
+    """
+    return functional.max_pool3d((payload.density[:, None] > 0).float(), 3, stride=1, padding=1)[:, 0] > 0
 
 
 def guess(model: DiffusionModel, payload: Payload) -> Payload:

@@ -33,9 +33,8 @@ DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fit
 LIMITS = (
     "The humans are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "
     "patterns drawn at random: no robes, uniforms, beards, glasses, wheelchairs or children.",
-    "Near collars and hems patterns of two garments can blend into one; hems of long skirts are ragged.",
+    "Lapels and frills at the collar are soft, hems of long skirts are ragged, and there are few prints.",
     "Body shapes are drawn from a Gaussian given the person; they suit the clothes on average only.",
-    "Sampling in few steps makes humans more alike than the training set; more steps let them differ more.",
 )
 """Limits of a model trained on such humans; stated on its card."""
 CODEC_LIMIT = (

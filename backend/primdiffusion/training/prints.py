@@ -9,10 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from primdiffusion.primitives.primitives import S
 
 ALIKE = 0.65
 """Least cosine of the patterns of two people who have the same print."""
@@ -22,6 +20,8 @@ FEWEST_GEOMETRIES = 4
 """With fewer people chance looks like a surface, or a print."""
 CLEAR = 0.02
 """Share of voxels that are wholly in the first colour, and in the second."""
+LEAST_SHARE = 0.5
+"""Of a voxel that a print is read in; others show too much of what is beside the garment."""
 FAINT = 0.03
 """Boxes with less of the second colour are left out."""
 
@@ -36,18 +36,25 @@ class Print(NamedTuple):
 
 
 def find_prints(
-    colours: Float[Tensor, "n r 512 3"], weight: Float[Tensor, "r 512"], geometry: Int[Tensor, "n"]
+    colours: Float[Tensor, "n r 512 3"],
+    weight: Float[Tensor, "r 512"],
+    share: Float[Tensor, "r 512"],
+    whole: Bool[Tensor, "r"],
+    geometry: Int[Tensor, "n"],
 ) -> list[Print]:
     """Prints of a garment with r boxes that enough people have; the most common one first.
 
     `colours` are those of its voxels on each of n people, over the garment's tones, and `weight` how much a voxel
-    counts. `geometry` tells people from further colourings of them.
+    counts. `share` of each voxel is the garment; prints are found in `whole` boxes and continued in the others.
+    `geometry` tells people from further colourings of them.
     """
-    share = (weight / weight.sum().clamp_min(1e-6)).flatten()
+    counted = (weight * whole[:, None]).flatten()
+    counted = counted / counted.sum().clamp_min(1e-6)
     flat = colours.flatten(1, 2)
-    centred = (flat - torch.einsum("v,nvc->nc", share, flat)[:, None]) * share.sqrt()[:, None]
+    differences = flat - torch.einsum("v,nvc->nc", counted, flat)[:, None]
+    centred = differences * counted.sqrt()[:, None]
     strong = (centred.square().sum((1, 2)) / 3).sqrt() > STRONG
-    centred, geometry = centred[strong], geometry[strong]
+    differences, centred, geometry = differences[strong], centred[strong], geometry[strong]
     if not len(centred):
         return []
     patterns = torch.stack([_leading(one.T) for one in centred])
@@ -57,7 +64,9 @@ def find_prints(
         same = alike[counts.argmax()] & left
         left &= ~same
         if len(geometry[same].unique()) >= FEWEST_GEOMETRIES:
-            prints.append(_print(_leading(centred[same].mT.flatten(0, 1)), share, weight.shape[0]))
+            scores = torch.einsum("v,nvc->nc", _leading(centred[same].mT.flatten(0, 1)), centred[same])
+            value = torch.einsum("nc,nvc->v", scores, differences[same]) / scores.square().sum().clamp_min(1e-12)
+            prints.append(_print(value / share.flatten().clamp_min(LEAST_SHARE), counted, weight))
     return prints
 
 
@@ -67,18 +76,16 @@ def _leading(rows: Float[Tensor, "m v"]) -> Float[Tensor, "v"]:
     return vector / vector.norm().clamp_min(1e-12)
 
 
-def _print(pattern: Float[Tensor, "v"], share: Float[Tensor, "v"], boxes: int) -> Print:
+def _print(value: Float[Tensor, "v"], counted: Float[Tensor, "v"], weight: Float[Tensor, "r 512"]) -> Print:
     """Shares of the second colour, which is that of fewer voxels."""
-    value = pattern / share.sqrt().clamp_min(1e-6)
     order = value.argsort()
-    before = share[order].cumsum(0)
+    before = counted[order].cumsum(0)
     first, second = (
         value[order[torch.searchsorted(before, at).clamp_max(len(order) - 1)]] for at in (CLEAR, 1 - CLEAR)
     )
     mixed = ((value - first) / (second - first).clamp_min(1e-6)).clamp(0, 1)
-    if (mixed * share).sum() > 0.5:
+    if (mixed * counted).sum() > 0.5:
         mixed = 1 - mixed
-    mixed = mixed.view(boxes, S**3)
-    of_boxes = share.view_as(mixed)
-    shown = (mixed * of_boxes).sum(1) > FAINT * of_boxes.sum(1)
+    mixed = mixed.view_as(weight)
+    shown = (mixed * weight).sum(1) > FAINT * weight.sum(1)
     return Print(shown.nonzero()[:, 0], mixed[shown])

@@ -1,9 +1,9 @@
 """Find surfaces of one colour: boxes and voxels whose colours follow that of a surface on all people who have it.
 
 Hair, hats, garments and skin are found by regressions on the colour of the surface, first that of a few boxes, then
-that of what was found, and on colours that it may go with: dark hair often goes with dark skin. Hair and hats are found
-in voxels, as they lie over skin and clothes; plain garments and skin in boxes, which they cover from border to border,
-and in voxels where they meet.
+that of what was found, and on colours that it may go with: dark hair often goes with dark skin. Hair, hats and shoes
+are found in voxels, as they lie over skin and clothes; plain garments and skin in boxes, which they cover from border
+to border, and in voxels where they meet.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
 UNEVEN_GARMENT = 0.0136
 """The same in the median over a garment's boxes: more are prints and fades, which plain garments may have too."""
-UNEVEN_BORDER = 0.09
+UNEVEN_BORDER = 0.12
 """The same of voxels where surfaces meet, in boxes that are wholly explained by them."""
-UNEXPLAINED = 0.3
+UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
 LEAST_SHARE = 0.05
 """Of a voxel: less is chance."""
@@ -63,36 +63,52 @@ class _Rows(NamedTuple):
     drawn: Bool[Tensor, "n"]
 
 
+class _Surface(NamedTuple):
+    """A surface, as fields of `Surfaces`."""
+
+    condition: Float[Tensor, "a"]
+    rows: _Rows
+    natural: bool = False
+    patterned: bool = False
+    """Whether people who have it wear a pattern there."""
+
+
 def fit_surfaces(
     people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
 ) -> Surfaces | None:
-    """Skin and plain garments of each outfit, styles of hair and hats, of detailed people; None if nothing is found.
+    """Skin and garments of each outfit, styles of hair, hats and shoes, of detailed people; None if nothing is found.
 
-    The people's attributes say who has them: `config.outfit`, `config.hair`, "pattern" (plain) and "hat" (or none).
+    The people's attributes say who has them: `config.outfit`, `config.hair`, "pattern" (plain), "hat" (or none) and
+    "shoes".
     """
     known = _People(people, codec, vocabulary, config)
-    found: list[tuple[Tensor, _Rows]] = []
+    found: list[_Surface] = []
     for outfit in vocabulary.categories.get(config.outfit, ()):
         found += known.worn({config.outfit: outfit}, known.only("pattern", "plain"))
     for hair in vocabulary.categories.get(config.hair, ()):
-        found += known.hair({config.hair: hair}, known.only("hat", "none"), hair in config.hanging)
+        styles = known.in_voxels({config.hair: hair}, known.only("hat", "none"), hair in config.hanging)
+        found += [style._replace(natural=True) for style in styles]
     for hat in vocabulary.categories.get("hat", ()):
         if hat != "none":
-            found += known.hair({"hat": hat})
+            found += known.in_voxels({"hat": hat})
+    for shoes in vocabulary.categories.get("shoes", ()):
+        found += known.in_voxels({"shoes": shoes}, where=("feet", "feet", "shins"))
     if not found:
         return None
-    conditions, rows = zip(*found, strict=True)
+    rows = [one.rows for one in found]
     surface = torch.cat([torch.full((len(each.cell),), number) for number, each in enumerate(rows)])
     cell, share, tone, read, drawn = (torch.cat(each) for each in zip(*rows, strict=True))
-    of_prints = [(torch.zeros(0, vocabulary.width), *(surface[:0],) * 3, share[:0])]
-    for garment, condition in enumerate(conditions):
-        boxes = ((surface == garment) & read & drawn).nonzero()[:, 0]
-        for values, found_print in known.prints(condition, cell[boxes], tone[boxes]):
-            number = torch.tensor([len(of_prints) - 1])
-            box = boxes[found_print.box]
-            of_prints.append((values[None], torch.tensor([garment]), number.expand(len(box)), box, found_print.second))
-    print_fields = (torch.cat(each) for each in zip(*of_prints, strict=True))
-    return Surfaces(torch.stack(conditions), surface, cell, share, tone, read, drawn, *print_fields)
+    garment, printed, box, second = [], [surface[:0]], [surface[:0]], [share[:0]]
+    for number, one in enumerate(found):
+        boxes = (surface == number).nonzero()[:, 0]
+        for found_print in known.prints(one):
+            printed.append(torch.full((len(found_print.box),), len(garment)))
+            garment.append(number)
+            box.append(boxes[found_print.box])
+            second.append(found_print.second)
+    of_prints = torch.tensor(garment, dtype=torch.int64), *(torch.cat(each) for each in (printed, box, second))
+    conditions, natural = torch.stack([one.condition for one in found]), torch.tensor([one.natural for one in found])
+    return Surfaces(conditions, natural, surface, cell, share, tone, read, drawn, *of_prints)
 
 
 class _People:
@@ -135,7 +151,7 @@ class _People:
         few = len(self.geometry[own].unique()) < FEWEST_GEOMETRIES
         return (own & (not few)).nonzero()[:, 0]
 
-    def worn(self, attributes: Mapping[str, str], plain: Mapping[str, str]) -> list[tuple[Tensor, _Rows]]:
+    def worn(self, attributes: Mapping[str, str], plain: Mapping[str, str]) -> list[_Surface]:
         """Skin and plain garments of an outfit, in the boxes that they cover and in the voxels where they meet."""
         row, own = self.with_all(attributes, hanging=False)
         boxes, face = self.boxes[own], region_of(("face",))
@@ -145,7 +161,7 @@ class _People:
         skin = _covered(boxes, region_of(("hands",)), beside, ~region_of(("hair",)))
         if skin is None or not (skin & face).any():
             return []
-        found = [(row, self.rows(own, skin, read=face, drawn=~face))]
+        of_skin = self.rows(own, skin, read=face, drawn=~face)
         whoever, everyone = row, own
         row, own = self.with_all({**attributes, **plain}, hanging=False)
         patterned = everyone[~torch.isin(everyone, own)]
@@ -157,36 +173,36 @@ class _People:
                 parts.append(garment)
         parts = [parts[0], *(part for part in parts[1:] if self.even(own, part))]
         if len(parts) == 1:
-            return found
+            return [_Surface(whoever, of_skin, natural=True)]
         meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
-        everywhere = torch.ones_like(skin)
+        everywhere, found = torch.ones_like(skin), []
         for part, border in zip(parts, self.borders(own, parts, meet), strict=True):
-            drawn = torch.full_like(skin, part is not parts[0])  # the face, where skin is read, keeps its colours
-            whole = self.rows(own, part, read=everywhere, drawn=drawn)
-            if part is not parts[0] and len(patterned) and self.even(patterned, part):
-                found.append((whoever, whole))  # the pattern is another garment's
-            found.append((row, _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))))
+            bare = part is parts[0]
+            whole = of_skin if bare else self.rows(own, part, read=everywhere, drawn=everywhere)
+            rows = _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))
+            if bare or (len(patterned) and self.even(patterned, part)):  # the pattern is another garment's
+                found.append(_Surface(whoever, rows, natural=bare))
+                continue
+            found.append(_Surface(row, rows))
+            others = {*self.vocabulary.categories.get("pattern", ())} - {*plain.values()} if plain else ()
+            for pattern in sorted(others):
+                condition = whoever + self.vocabulary.encode({"pattern": pattern})
+                found.append(_Surface(condition, rows._replace(drawn=~rows.read), patterned=True))
         return found
 
     def even(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> bool:
         """Whether it has one colour on these people."""
         return bool(_tones(self.boxes[people], garment)[1][garment].median() < UNEVEN_GARMENT)
 
-    def prints(
-        self, condition: Float[Tensor, "a"], cells: Int[Tensor, "r"], tone: Float[Tensor, "r 512"]
-    ) -> Iterator[tuple[Float[Tensor, "a"], Print]]:
-        """Prints on a garment whose plain form is worn by people of this condition, and the condition of each."""
-        plain = self.vocabulary.encode(self.only("pattern", "plain"))
-        if not len(cells) or not plain.any() or condition @ plain == 0:
-            return
-        for pattern in sorted({*self.vocabulary.categories["pattern"]} - {"plain"}):
-            row = condition - plain + self.vocabulary.encode({"pattern": pattern})
-            own = self.of(row, hanging=False)
-            if len(own):
-                voxels = torch.cat([voxels[:, cells] for voxels in self.voxels(own)])
-                weight = seen(voxels).mean(0) * (tone > DIMMEST)
-                untoned = voxels[..., :3] / tone.clamp_min(DIMMEST)[..., None]
-                yield from ((row, one) for one in find_prints(untoned, weight, self.geometry[own]))
+    def prints(self, garment: _Surface) -> list[Print]:
+        """Prints on a garment of patterned people."""
+        own, rows = self.of(garment.condition, hanging=False), garment.rows
+        if not garment.patterned or not len(own):
+            return []
+        voxels = torch.cat([voxels[:, rows.cell] for voxels in self.voxels(own)])
+        weight = seen(voxels).mean(0) * rows.share * (rows.tone > DIMMEST)
+        untoned = voxels[..., :3] / rows.tone.clamp_min(DIMMEST)[..., None]
+        return find_prints(untoned, weight, rows.share, rows.read, self.geometry[own])
 
     def rows(
         self, own: Int[Tensor, "n"], part: Bool[Tensor, "k"], read: Bool[Tensor, "k"], drawn: Bool[Tensor, "k"]
@@ -229,30 +245,35 @@ class _People:
             borders.append(_Rows(cells[kept], *rows))
         return reversed(borders)
 
-    def hair(
-        self, attributes: Mapping[str, str], shown: Mapping[str, str] = {}, hanging: bool = False
-    ) -> list[tuple[Tensor, _Rows]]:
-        """The voxels of a style of hair, or a hat, on the head, and on the clothes if it hangs over them.
+    def in_voxels(
+        self,
+        attributes: Mapping[str, str],
+        shown: Mapping[str, str] = {},
+        hanging: bool = False,
+        where: tuple[str, str, str] = ("head", "hair", "hands"),
+    ) -> list[_Surface]:
+        """The voxels of a style of hair, or a hat, on the head, and on the clothes if it hangs over them; or of shoes.
 
-        They are found on people with the attributes `shown` too: those without a hat.
+        They are found on people with the attributes `shown` too: those without a hat. `where` names the part on which
+        they are, the one that has their colour, and one that has that of what is beside them.
         """
         row = self.vocabulary.encode(attributes)
         _, own = self.with_all({**attributes, **shown})
         if not len(own):
             return []
-        head, below = region_of(("head",)), region_of(("torso", "hips", "arms"))
-        cells = (head | below if hanging else head).nonzero()[:, 0]
-        on_head = head[cells]
-        skin, colour = (self.boxes[own][:, region_of((name,))].mean(1) for name in ("hands", "hair"))
-        if _left_of(colour, skin) < BALD:
+        part, below = region_of(where[:1]), region_of(("torso", "hips", "arms"))
+        cells = (part | below if hanging else part).nonzero()[:, 0]
+        on_part = part[cells]
+        colour, beside = (self.boxes[own][:, region_of((name,))].mean(1) for name in where[1:])
+        if _left_of(colour, beside) < BALD:
             return []
         share = torch.zeros(len(cells), S**3)
         for number in range(PASSES):
             if number:
-                sure = (share[on_head] - SURELY).clamp_min(0)
-                on_heads = (voxels[:, cells[on_head]] for voxels in self.voxels(own))
-                colour = torch.cat([_mean(v.flatten(1, 2), (sure * seen(v)).flatten(1)) for v in on_heads])
-            normal, design = _normal([colour, skin])
+                sure = (share[on_part] - SURELY).clamp_min(0)
+                of_part = (voxels[:, cells[on_part]] for voxels in self.voxels(own))
+                colour = torch.cat([_mean(v.flatten(1, 2), (sure * seen(v)).flatten(1)) for v in of_part])
+            normal, design = _normal([colour, beside])
             by_design, by_colour, density = (torch.zeros(len(cells), S**3, *size) for size in ((2,), (), ()))
             for x, some, voxels in zip(design.split(CHUNK), colour.split(CHUNK), self.voxels(own), strict=True):
                 by_design += torch.einsum("ncq,nkvc->kvq", x, voxels[:, cells, :, :3])
@@ -263,11 +284,12 @@ class _People:
             slope = _smooth(slope) / _smooth(tone).clamp(DARKEST, 1)
             share = ((slope - NO_HAIR) / (ALL_HAIR - NO_HAIR)).clamp(0, 1)
             share *= (((share > 0.5) & (density > SOLID)).sum(1) >= FEWEST_VOXELS)[:, None]
-            if not share[on_head].any():
+            if not share[on_part].any():
                 return []
         kept = share.any(1)
         tone = tone * (share > 0)
-        return [(row, _Rows(cells[kept], share[kept], tone[kept], on_head[kept], torch.ones_like(on_head[kept])))]
+        rows = _Rows(cells[kept], share[kept], tone[kept], on_part[kept], torch.ones_like(on_part[kept]))
+        return [_Surface(row, rows)]
 
 
 class _Meeting(NamedTuple):

@@ -91,7 +91,7 @@ def test_released_compositing_keeps_the_noise_of_ddims_last_level_and_encodes_pr
     for name in ("linear", "released"):
         cli.run([
             "generate", "--checkpoint", str(checkpoint), "--seed", "3", "--steps", "4", "--size", "24",
-            "--out", str(tmp_path / name), "--compositing", name,
+            "--out", str(tmp_path / name), "--compositing", name, "--sampler", "ddim",
         ])  # fmt: skip
     model = load_checkpoint(checkpoint)
     schedule = model.schedule

@@ -9,7 +9,7 @@ from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import check_surfaces
-from primdiffusion.diffusion.surfaces import BRIGHTEST, Surfaces, voxels_of
+from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, Surfaces, voxels_of
 from primdiffusion.editing.regions import region_of
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.config import PriorConfig
@@ -24,11 +24,12 @@ WORDS = AttributeVocabulary(
         "pattern": ("patterned", "plain"),
         "hair": ("bald", "long", "short"),
         "hat": ("cap", "none"),
+        "shoes": ("boots",),
     },
     {},
 )
 GEOMETRIES, COLOURINGS = 6, 6
-WORN = ("hair", "tee", "trousers", "skin", "cap", "print")
+WORN = ("hair", "tee", "trousers", "skin", "cap", "print", "boots")
 INNER, OUTER = slice(0, S**3 // 2), slice(S**3 // 2, S**3)
 """Halves of a box, near the body and away from it."""
 FAR_IN, FAR_OUT = slice(0, S**3 // 2 - S**2), slice(S**3 // 2 + S**2, S**3)
@@ -64,8 +65,8 @@ def below_cap():
 
 
 def second_of(pattern):
-    """Boxes of a tee in its second colour."""
-    tee = region_of(TOP)
+    """Boxes of a tee and its collar in the second colour."""
+    tee = region_of((*TOP, *COLLAR))
     every_third = torch.zeros(K, dtype=torch.bool).index_fill(0, tee.nonzero()[::3, 0], True)
     return {"stripes": every_third, "block": region_of(CUFFS)}[pattern]
 
@@ -76,7 +77,7 @@ def printed(colours, pattern, strength=1.0):
     return torch.where(region_of(CUFFS)[:, None], CUFF * boxes, boxes)
 
 
-def dressed(hair, colours, generator, pattern="", cap=False, outfit="tee"):
+def dressed(hair, colours, generator, pattern="", cap=False, outfit="tee", boots=False):
     """Cells of a person in a tee with faded trousers or leggings, or in a suit."""
     voxels = torch.zeros(K, S**3, 4)
     voxels[..., 3] = 1.0
@@ -89,12 +90,15 @@ def dressed(hair, colours, generator, pattern="", cap=False, outfit="tee"):
     voxels[region_of(COLLAR), OUTER, :3] = colours["tee"]
     feet = region_of(("feet",))  # socks of the tee's colour, darker or brighter on everybody: no border of surfaces
     voxels[feet, :, :3] = (0.8 + 0.4 * torch.rand(int(feet.sum()), 1, 1, generator=generator)) * colours["tee"]
+    if boots:
+        voxels[feet, INNER, :3], voxels[feet, OUTER, :3] = colours["skin"], colours["boots"]
     if outfit == "leggings":
         voxels[region_of(LEGGINGS), :, :3] = colours["trousers"]
     if outfit == "suit":
         voxels[region_of((*TOP, "hips", "thighs")), :, :3] = colours["tee"]
     if pattern:
         voxels[region_of(TOP), :, :3] = printed(colours, pattern)[region_of(TOP), None]
+        voxels[region_of(COLLAR), OUTER, :3] = printed(colours, pattern)[region_of(COLLAR), None]
     if hair == "bald":
         voxels[region_of(("hair",)), :, :3] *= 0.9 + 0.2 * torch.rand(1, generator=generator)
     else:
@@ -109,6 +113,7 @@ def dressed(hair, colours, generator, pattern="", cap=False, outfit="tee"):
 def some_colours(generator):
     """Dark hair goes with dark skin."""
     drawn = {name: 0.15 + 0.7 * torch.rand(3, generator=generator) for name in WORN}
+    drawn |= {name: drawn[name].sort(descending=True).values for name in ("hair", "skin")}
     return drawn | {"skin": 0.75 * drawn["skin"] + 0.25 * drawn["hair"]}
 
 
@@ -123,8 +128,10 @@ def people(codec):
         )
         for number in range(COLOURINGS):
             pattern = PRINTS[geometry % 2] if number == 0 and outfit != "suit" else ""
-            cells.append(dressed(hair, some_colours(generator), generator, pattern, name == "cap", outfit))
+            boots = geometry % 3 == 0
+            cells.append(dressed(hair, some_colours(generator), generator, pattern, name == "cap", outfit, boots))
             known = {"outfit": outfit, "pattern": "patterned" if pattern else "plain"}
+            known |= {"shoes": "boots"} if boots else {}
             conditions.append(WORDS.encode({**known, "hair": hair, "hat": "cap" if name == "cap" else "none"}))
     geometry = torch.arange(len(names)).repeat_interleave(COLOURINGS)
     latents = codec.encode(torch.stack(cells)).half()
@@ -170,6 +177,13 @@ def test_hair_is_found_where_people_of_a_style_have_it(surfaces):
     assert not rows_of(surfaces, hair="bald")  # whose scalp has the colour of the hands
 
 
+def test_shoes_are_found_in_the_voxels_that_they_cover(surfaces):
+    ((cell, share),) = ((each.cell, each.share) for each in rows_of(surfaces, shoes="boots"))
+    assert torch.equal(over(torch.ones_like(cell), cell).bool(), region_of(("feet",)))
+    assert float(share[:, FAR_OUT].min()) > 0.9
+    assert float(share[:, FAR_IN].max()) < 0.1
+
+
 def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
     garments, (skin,) = rows_of(surfaces, outfit="tee", pattern="plain"), rows_of(surfaces, outfit="tee")
     tee = next(each for each in garments if region_of(("torso",))[each.cell].any())
@@ -195,7 +209,7 @@ def test_a_pattern_on_the_tee_leaves_the_leggings_in_one_colour(surfaces):
 
 
 def test_voxels_where_surfaces_meet_belong_to_each(surfaces):
-    bare, tee = (each for each in rows_of(surfaces, outfit="tee", pattern="plain"))
+    (bare,), (tee,) = rows_of(surfaces, outfit="tee"), rows_of(surfaces, outfit="tee", pattern="plain")
     collar = region_of(COLLAR)
     assert region_of(("face",))[bare.cell[bare.read]].all()
     below, above = (over(part.share * part.drawn[:, None], part.cell) for part in (bare, tee))
@@ -204,7 +218,7 @@ def test_voxels_where_surfaces_meet_belong_to_each(surfaces):
     assert float(below[collar][:, FAR_IN].min()) > 0.9
     for part, share in ((bare, below), (tee, above)):
         assert not part.read[collar[part.cell]].any()
-        assert not share[region_of(("shins", "feet", "thighs"))].any()  # which no two surfaces share
+        assert not share[region_of(("feet", "thighs"))].any()  # which no two surfaces share
 
 
 @pytest.mark.parametrize("cap", [False, True])
@@ -233,6 +247,21 @@ def test_what_took_other_colours_gets_its_own_back(surfaces, cap):
     assert torch.equal(voxels_of(mended)[..., 3], voxels_of(wrong)[..., 3])
 
 
+def test_hair_and_skin_are_never_bluish_and_black_shows_folds(surfaces):
+    natural = surfaces.condition[surfaces.natural]
+    for name, values in {"hair": ("long", "short"), "outfit": ("tee", "suit", "leggings")}.items():
+        assert all((natural == WORDS.encode({name: value})).all(1).any() for value in values)
+    assert not (natural @ WORDS.encode({"hat": "cap"})).any()
+    assert not (natural @ WORDS.encode({"pattern": "plain"})).any()
+    colours = some_colours(torch.Generator().manual_seed(2))
+    colours |= {"hair": torch.tensor([0.2, 0.25, 0.3]), "tee": torch.zeros(3)}
+    cells = dressed("short", colours, torch.Generator(), outfit="suit")[None]
+    kind = WORDS.encode({"outfit": "suit", "pattern": "plain", "hair": "short", "hat": "none"})[None]
+    drawn = voxels_of(surfaces.recolour(cells, kind)[0])[..., :3]
+    assert float(drawn[region_of(("hair",))][:, FAR_OUT].std(-1).max()) < 0.01
+    torch.testing.assert_close(drawn[region_of(("torso",))].mean((0, 1)), torch.full((3,), BLACK), atol=0.02, rtol=0)
+
+
 @pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {}])
 def test_people_without_known_surfaces_stay_as_they_are(surfaces, known):
     cells = torch.rand(1, K, VALUES)
@@ -249,9 +278,9 @@ def test_patterned_garments_keep_their_pattern(surfaces, density):
 
 
 def test_prints_that_people_share_are_found(surfaces):
-    assert len(surfaces.print_condition) == len(PRINTS)
-    for condition in surfaces.print_condition:
-        assert torch.equal(condition, WORDS.encode({"outfit": "tee", "pattern": "patterned"}))
+    assert len(surfaces.garment) == len(PRINTS)
+    for garment in surfaces.garment:
+        assert torch.equal(surfaces.condition[garment], WORDS.encode({"outfit": "tee", "pattern": "patterned"}))
     found = [
         over(surfaces.second[own], surfaces.cell[surfaces.box[own]])
         for own in (surfaces.printed == number for number in range(len(PRINTS)))
@@ -285,6 +314,20 @@ def test_a_mixture_of_prints_becomes_the_nearest_one(surfaces, pattern, hair):
     torch.testing.assert_close(after.mean(0), before.mean(0), atol=0.02, rtol=0)
 
 
+@pytest.mark.parametrize("pattern", PRINTS)
+def test_a_print_goes_on_where_the_garment_meets_skin(surfaces, pattern):
+    generator = torch.Generator().manual_seed(4)
+    right = dressed("bald", some_colours(generator), generator, pattern)
+    collar, wrong = region_of(COLLAR), voxels_of(right).clone()
+    wrong[collar, :, :3] = torch.rand(int(collar.sum()), S**3, 3, generator=generator)
+    wrong = torch.nn.functional.pad(wrong.mT.flatten(1), (0, 3), value=SCALE_VALUE)
+    kind = WORDS.encode({"outfit": "tee", "pattern": "patterned", "hair": "bald", "hat": "none"})
+    mended = surfaces.recolour(wrong[None], kind[None])[0]
+    for part in (FAR_IN, FAR_OUT):
+        error = (voxels_of(mended) - voxels_of(right))[collar, part, :3].abs()
+        assert float(error.mean()) < 0.03
+
+
 @pytest.mark.parametrize(("pattern", "even"), [("", True), *((pattern, False) for pattern in PRINTS)])
 def test_plain_clothes_are_told_from_patterned_ones(surfaces, pattern, even):
     generator = torch.Generator().manual_seed(5)
@@ -313,9 +356,9 @@ def model_with_surfaces():
     share, tone = (torch.rand(5, S**3, generator=generator) for _ in range(2))
     read = torch.tensor([True, True, True, False, False])
     surfaces = Surfaces(
-        torch.tensor([[1.0, 0, 1, 0]]), torch.zeros(5, dtype=torch.int64), torch.arange(40, 45), share,
-        BRIGHTEST * tone, read, torch.ones_like(read),
-        torch.tensor([[0.0, 1, 0, 1]]), torch.zeros(1, dtype=torch.int64), torch.zeros(2, dtype=torch.int64),
+        torch.tensor([[1.0, 0, 1, 0]]), torch.tensor([True]), torch.zeros(5, dtype=torch.int64), torch.arange(40, 45),
+        share, BRIGHTEST * tone, read, torch.ones_like(read),
+        torch.zeros(1, dtype=torch.int64), torch.zeros(2, dtype=torch.int64),
         torch.arange(2), torch.rand(2, S**3, generator=generator),
     )  # fmt: skip
     return dataclasses.replace(model, surfaces=surfaces), surfaces
@@ -346,7 +389,7 @@ def test_surfaces_are_stored_in_bytes(tmp_path):
     torch.testing.assert_close(loaded.share, surfaces.share, atol=0.5 / 255 + 1e-6, rtol=0)
     torch.testing.assert_close(loaded.tone, surfaces.tone, atol=0.5 * BRIGHTEST / 255 + 1e-6, rtol=0)
     torch.testing.assert_close(loaded.second, surfaces.second, atol=0.5 / 255 + 1e-6, rtol=0)
-    for name in ("condition", "surface", "cell", "read", "drawn", "print_condition", "garment", "printed", "box"):
+    for name in ("condition", "natural", "surface", "cell", "read", "drawn", "garment", "printed", "box"):
         assert torch.equal(getattr(loaded, name), getattr(surfaces, name))
 
 
@@ -355,8 +398,9 @@ def test_surfaces_are_stored_in_bytes(tmp_path):
     [
         ({"cell": torch.arange(K, K + 5)}, "cell"),
         ({"cell": torch.arange(4)}, ""),
+        ({"natural": torch.ones(2, dtype=torch.bool)}, "natural"),
         ({"surface": torch.ones(5, dtype=torch.int64)}, "surface"),
-        ({"condition": torch.ones(1, 3)}, "condition"),
+        ({"condition": torch.ones(1, 3)}, "described"),
         ({"share": torch.full((5, S**3), 1.5)}, "share"),
         ({"tone": torch.full((5, S**3), -0.5)}, "tone"),
         ({"garment": torch.ones(1, dtype=torch.int64)}, "garment"),

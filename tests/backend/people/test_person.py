@@ -285,10 +285,12 @@ def test_fits_look_more_like_the_mesh_from_sides_not_shown_and_from_a_guess_leav
     found = [fitted_payloads(colourings, frames, people[0].betas, start, brief) for start in (None, model)]
     for payloads in found:
         assert torch.equal(payloads[0].density, payloads[1].density)
+        near = payloads_module.near_surface(from_mesh(colourings[0], frames))
+        assert not payloads[0].density[~near].any()  # no smoke
         for payload, mesh in zip(payloads, colourings, strict=True):
             start = from_mesh(mesh, frames)
             for view in views:
-                assert psnr(payload, mesh, view) > psnr(start, mesh, view) + 1.0, view
+                assert psnr(payload, mesh, view) > psnr(start, mesh, view) + 0.8, view
     for from_the_mesh, from_the_model in zip(*found, strict=True):
         assert unexplained(from_the_model) < 0.7 * unexplained(from_the_mesh)
 

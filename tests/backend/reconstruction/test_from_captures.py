@@ -67,9 +67,10 @@ def test_unseen_sides_have_surfaces_of_one_colour():
     front, back = depth.argmax()[None], depth.argmin()[None]
     ones = torch.ones(2, S**3)
     surfaces = Surfaces(
-        torch.zeros(1, MODEL.vocabulary.width), torch.zeros(2, dtype=torch.int64), torch.cat([front, back]), ones,
+        torch.zeros(1, MODEL.vocabulary.width), torch.tensor([False]), torch.zeros(2, dtype=torch.int64),
+        torch.cat([front, back]), ones,
         torch.stack([ones[0], 0.5 * ones[0]]), torch.tensor([True, False]), torch.tensor([False, True]),
-        torch.zeros(0, MODEL.vocabulary.width), *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0],
+        *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0],
     )  # fmt: skip
     person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
     plain, found = (

@@ -37,7 +37,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
     assert len(parts_of(person)) == 3
     sent = request_of(person_file(person))
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
-    sampling = {"seed": 7, "steps": 3, "sampler": "ddim", "guidance": 2.0}
+    sampling = {"seed": 7, "steps": 3, "sampler": "dpmpp_2m", "guidance": 2.0}
     assert sent == {**sampling, "compact": True, "size": 16, "picture_px": 256}
     assert not queue.busy
     assert error_of("generate") == ""

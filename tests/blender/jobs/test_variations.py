@@ -68,7 +68,7 @@ def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(add
     ops.variations()
     first = seeds()
     asked = sent(sheet.variations[0].person)
-    assert (asked["steps"], asked["sampler"], asked["size"]) == (60, "ddim", 256)
+    assert (asked["steps"], asked["sampler"], asked["size"]) == (60, "dpmpp_2m", 256)
     addon.scene.primdiffusion.quality, settings.count = "DRAFT", "8"
     ops.variations()
     assert len(set(seeds())) == 8

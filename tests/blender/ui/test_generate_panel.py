@@ -88,17 +88,17 @@ def test_seeds_beyond_blenders_numbers_are_rejected(addon, panel_settings):
 
 
 def test_a_quality_stands_for_steps_and_sampler_and_these_name_the_quality(panel_settings):
-    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("STANDARD", 30, "ddim")
+    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("STANDARD", 20, "dpmpp_2m")
     panel_settings.quality = "DRAFT"
     assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("DRAFT", 8, "dpmpp_2m")
     panel_settings.quality = "HIGH"
-    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("HIGH", 60, "ddim")
+    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("HIGH", 60, "dpmpp_2m")
     panel_settings.steps = 17
     assert panel_settings.quality == "CUSTOM"
-    panel_settings.steps = 30
+    panel_settings.steps = 20
     assert panel_settings.quality == "STANDARD"
     panel_settings.quality = "CUSTOM"
-    assert (panel_settings.quality, panel_settings.steps) == ("CUSTOM", 30)
+    assert (panel_settings.quality, panel_settings.steps) == ("CUSTOM", 20)
 
 
 def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_of_the_backend(
