@@ -231,7 +231,7 @@ def test_payloads_are_stored_whole_and_mended(assets, tmp_path, monkeypatch):
     monkeypatch.setattr(payloads_module, "fit_payload", lambda start, *_: start)
     monkeypatch.setattr(payloads_module, "fit_colours", with_density)
     monkeypatch.setattr(payloads_module, "_targets", lambda *_: [[]])
-    reports, method = [], f"fitted 2 from {load_checkpoint().card['sha256'][:12]}"
+    reports, method = [], f"fitted 3 from {load_checkpoint().card['sha256'][:12]}"
     (path,) = make_payloads(assets, tmp_path, 1, 2, 3, 1, report=lambda done, total: reports.append((done, total)))
     assert reports == [(0, 1), (1, 1)]
     with np.load(path, allow_pickle=False) as file:
