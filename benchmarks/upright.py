@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -87,23 +88,7 @@ class Case(NamedTuple):
 
 
 def main() -> None:
-    parser = options(people=8)
-    parser.add_argument("--sheet", type=Path, help="picture of the humans")
-    arguments = parser.parse_args()
-    assets, model = open_assets(arguments.assets, required_meshes()), load_checkpoint(arguments.checkpoint)
-    rows, sheet = [], []
-    with tempfile.TemporaryDirectory() as scratch:
-        for number in range(arguments.people):
-            case = drawn(assets, number, Path(scratch))
-            began = time.process_time()
-            start = start_of([case.photograph], model)
-            posture = fit_posture_in(model, [case.photograph], start, lambda: None).posture
-            seconds = time.process_time() - began
-            human = reconstruct(model, person_in([case.photograph], posture))
-            row = errors(case, posture) | {"front_psnr": front_psnr(human, case, posture), "fit_seconds_cpu": seconds}
-            print(number, f"pitch {case.pitch:.1f}", {key: round(value, 2) for key, value in row.items()}, flush=True)
-            rows.append(row)
-            sheet.append(sheet_row(human, case, posture))
+    rows, path = measured(8, of_one)
     of = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     figures: dict[str, float | int] = {
         "lean_error_median_deg": np.median(of["lean_error_deg"]),
@@ -113,26 +98,41 @@ def main() -> None:
         "pitch_error_median_deg": np.median(of["pitch_error_deg"]),
         **{name: of[name].mean() for name in ("camera_error_px", "front_psnr", "fit_seconds_cpu")},
     }
-    if arguments.sheet is not None:
-        Image.fromarray(np.concatenate(sheet)).save(arguments.sheet, quality=88)
-    report({name: round(float(value), 3) for name, value in figures.items()} | {"people": len(rows)}, arguments.json)
+    report({name: round(float(value), 3) for name, value in figures.items()} | {"people": len(rows)}, path)
 
 
 def several() -> None:
-    parser = options(people=3)
+    rows, path = measured(6, of_sides)
+    figures = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    figures |= {"several_turn_error_deg": max(row["several_turn_error_deg"] for row in rows)}
+    add({name: round(value, 3) for name, value in figures.items()} | {"several_people": len(rows)}, path)
+
+
+def measured(people: int, of: Callable[..., dict[str, float]]) -> tuple[list[dict[str, float]], Path | None]:
+    """Figures of each human, and where the record goes; the command line says how many, and where their sheet goes."""
+    parser = options(people)
     parser.add_argument("--sheet", type=Path, help="picture of the humans")
     arguments = parser.parse_args()
     assets, model = open_assets(arguments.assets, required_meshes()), load_checkpoint(arguments.checkpoint)
     rows, sheet = [], []
     with tempfile.TemporaryDirectory() as scratch:
         for number in range(arguments.people):
-            rows.append(of_sides(model, assets, number, Path(scratch), sheet))
+            rows.append(of(model, assets, number, Path(scratch), sheet))
             print(number, {key: round(value, 2) for key, value in rows[-1].items()}, flush=True)
-    figures = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    figures |= {"several_turn_error_deg": max(row["several_turn_error_deg"] for row in rows)}
     if arguments.sheet is not None:
         Image.fromarray(np.concatenate(sheet)).save(arguments.sheet, quality=88)
-    add({name: round(value, 3) for name, value in figures.items()} | {"several_people": len(rows)}, arguments.json)
+    return rows, arguments.json
+
+
+def of_one(model: DiffusionModel, assets, number: int, folder: Path, sheet: list[np.ndarray]) -> dict[str, float]:
+    """Figures of a human from one picture, whose row is added to the sheet."""
+    case, began = drawn(assets, number, folder), time.process_time()
+    start = start_of([case.photograph], model)
+    posture = fit_posture_in(model, [case.photograph], start, lambda: None).posture
+    seconds = time.process_time() - began
+    human = reconstruct(model, person_in([case.photograph], posture))
+    sheet.append(sheet_row(human, case, posture))
+    return errors(case, posture) | {"front_psnr": front_psnr(human, case, posture), "fit_seconds_cpu": seconds}
 
 
 def drawn(assets, number: int, folder: Path, turned: float = 0.0, other: int = 0) -> Case:
@@ -164,7 +164,8 @@ def drawn(assets, number: int, folder: Path, turned: float = 0.0, other: int = 0
 def of_sides(model: DiffusionModel, assets, number: int, folder: Path, sheet: list[np.ndarray]) -> dict[str, float]:
     """Figures of a human from three pictures, whose rows are added to the sheet."""
     cases = [drawn(assets, number, folder, turned, i) for i, turned in enumerate(SIDES.values())]
-    photographs = [case.photograph for case in cases]
+    photographs = read_photographs([case.photograph.path for case in cases])
+    cases = [case._replace(photograph=one) for case, one in zip(cases, photographs, strict=True)]
     posture = fit_posture_in(model, photographs, start_of(photographs, model), lambda: None).posture
     poses, cameras = list(each(posture.pose)), list(each(posture.camera))
     front = Posture(posture.pose.map(lambda values: values[:1]), posture.betas, stack(cameras[:1]))

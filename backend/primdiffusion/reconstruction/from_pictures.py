@@ -6,7 +6,6 @@ that then explain the pictures (`reconstruction`) give it the colours by which l
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -27,7 +26,7 @@ from primdiffusion.formats.camera_rig import View
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
-from primdiffusion.reconstruction.posture_quality import FitQuality, quality_of
+from primdiffusion.reconstruction.posture_quality import FitQuality, colour_error, quality_of
 from primdiffusion.reconstruction.posture_start import (
     STANCES,
     before_cameras,
@@ -40,7 +39,7 @@ from primdiffusion.reconstruction.posture_start import (
     turned_to_camera,
     views_of,
 )
-from primdiffusion.reconstruction.prior_fit import Explanation, PriorFit, targets_of
+from primdiffusion.reconstruction.prior_fit import PriorFit, targets_of
 from primdiffusion.render.image import PosedView
 
 
@@ -61,15 +60,13 @@ OUTLINE_SIDE = 64
 """Of the pictures that choose how a standing body stands."""
 LIKELY_START, LIKELY = 1.8, 1.5
 """How much worse than the best an outline may be for a turn of the body to be tried, and after the first round."""
-STANCES_TRIED = 3
-"""In a single picture; the first round leaves one."""
-FRONT = 30.0
-"""Logarithm of how much more probable a picture from the front is than one from behind: most people show their face,
-and colours tell less before the pose is found exactly."""
+STANCES_TRIED, STANCE_BLUR = 3, 0.03
+"""In a single picture; the first round leaves the one whose outline is best after a blur by this share of the side: an
+arm beside the true one is better than none."""
 OWN_COLOURS = Stage(20, 0.03, upright=False)
-"""Before colours decide on turns, with those of each: limbs that are elsewhere would count more than a face."""
+"""Before colours decide on turns, with those of each: limbs find their places."""
 TURN_STEPS = 3
-"""Gauss-Newton steps on coefficients whose evidence tells the turns that are left: a face from hair."""
+"""Gauss-Newton steps on coefficients before."""
 OUTLINE_IN_PICTURE = 256
 """Largest side of the drawing of a body over a picture without a mask, pixels."""
 POSE_FILE_TIGHTNESS = 2.0
@@ -239,13 +236,10 @@ def fit_posture_in(
         fit.refine(payload, targets(side), stage, on_step, shaped=not several)  # a wrong turn would bend the shape
         if several:
             if coefficient_steps:
-                facing = fit.posture().facing.tolist()
-                errors, seen = _seen_closely(components, fit, [photographs[one] for one in pictures], side)
-                alone = [error + FRONT * (1 - away) / 2 for error, away in zip(errors, facing, strict=True)]
-                kept = _explained(components, seen, pictures, alone)
+                kept = _turns(components, fit, [photographs[one] for one in pictures], pictures, side)
             else:
-                share = LIKELY if len(photographs) > 1 else 1.0
-                kept = _likely([outline_error(payload, one) for one in targets(side)], pictures, share)
+                share, blur = (LIKELY, 0.0) if len(photographs) > 1 else (1.0, STANCE_BLUR)
+                kept = _likely([outline_error(payload, one, blur) for one in targets(side)], pictures, share)
             fit.keep(kept)
             pictures = [pictures[one] for one in kept]
         for _ in range(coefficient_steps):
@@ -254,7 +248,7 @@ def fit_posture_in(
     return Found(fit.posture(), photographs)
 
 
-def _likely(errors: Sequence[float] | np.ndarray, pictures: Sequence[int], share: float = 1.0) -> list[int]:
+def _likely(errors: Sequence[float], pictures: Sequence[int], share: float = 1.0) -> list[int]:
     """Numbers of the errors that are the least of their picture, or less than `share` times as large."""
     least: dict[int, int] = {}
     for number, picture in enumerate(pictures):
@@ -263,53 +257,32 @@ def _likely(errors: Sequence[float] | np.ndarray, pictures: Sequence[int], share
     return [one for one, own in pairs if one == least[own] or errors[one] < share * errors[least[own]]]
 
 
-def _seen_closely(
-    components: PriorFit, fit: PostureFit, photographs: Sequence[Photograph], side: int
-) -> tuple[list[float], list[PosedView]]:
-    """How badly a person explains each picture alone, and the picture with the boxes that explain it better: those of
-    the fit, or after some steps more with the colours of that person.
-    """
-    targets, closer = _targets(photographs, fit.posture(), side), copy.deepcopy(fit)
-    people = [_person_in(components, [one]) for one in targets]
-    own = [components.payload(components.coefficients(one)) for one in people]
-    closer.refine(own, targets, OWN_COLOURS, shaped=False)
-    errors, seen = [], []
-    for before, *pair in zip(people, targets, _targets(photographs, closer.posture(), side), strict=True):
-        both = [-before.evidence, -_person_in(components, pair[1:]).evidence]
-        errors.append(min(both))
-        seen.append(pair[both.index(min(both))])
-    return errors, seen
-
-
-def _explained(
-    components: PriorFit, targets: Sequence[PosedView], pictures: Sequence[int], alone: Sequence[float]
+def _turns(
+    components: PriorFit, fit: PostureFit, photographs: Sequence[Photograph], pictures: Sequence[int], side: int
 ) -> list[int]:
-    """Numbers of the turns that explain the pictures best, one for each; `alone`: how badly each does for itself.
+    """Numbers of the turns, one for each picture, with which one person explains the first picture and each other best.
 
-    Pictures are decided one after the other, the clearest first; each has to show the same person as those before.
+    In a wrong turn that person has hair for a face in one of the two; turned wrongly in both, hair with a mouth.
     """
-    turns = [[one for one, own in enumerate(pictures) if own == picture] for picture in sorted(set(pictures))]
-
-    def doubt(numbers: list[int]) -> float:
-        best, *others = sorted(alone[one] for one in numbers)
-        return best - others[0] if others else -math.inf
-
-    kept: list[int] = []
-    for numbers in sorted(turns, key=doubt):
-        errors = dict(enumerate(alone))
-        if kept and len(numbers) > 1:
-            before = [targets[one] for one in kept]
-            errors = {one: -_person_in(components, [*before, targets[one]]).evidence for one in numbers}
-        kept.append(min(numbers, key=errors.__getitem__))
-    return sorted(kept)
+    targets, found = _targets(photographs, fit.posture(), side), []
+    fit.refine([_person_in(components, [one]) for one in targets], targets, OWN_COLOURS, shaped=False)
+    targets = _targets(photographs, fit.posture(), side)
+    for first in range(pictures.count(0)):
+        errors = [0.0 if number == first else math.inf for number in range(pictures.count(0))]
+        for other in targets[len(errors) :]:
+            person = _person_in(components, [targets[first], other])
+            errors.append(colour_error(person, targets[first]) + colour_error(person, other))
+        kept = _likely(errors, pictures)
+        found.append((sum(errors[one] for one in kept), kept))
+    return min(found)[1]
 
 
-def _person_in(components: PriorFit, targets: Sequence[PosedView]) -> Explanation:
-    """The person of any colours that explains pictures best: a face tells front from back."""
+def _person_in(components: PriorFit, targets: Sequence[PosedView]) -> Payload:
+    """The person of any colours that explains pictures best."""
     people = components.everyone()
     for _ in range(TURN_STEPS):
         people = components.closer(people, targets)
-    return people
+    return components.payload(components.coefficients(people))
 
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:

@@ -40,8 +40,8 @@ TILT_STD = torch.tensor([math.radians(12), 0.0, math.radians(2.5)])
 """Standard deviations of a held camera's pitch, yaw and roll; the body's own yaw stands for that of the camera."""
 HEIGHT_M, HEIGHT_STD_M = 1.5, 0.3
 """Height of a held camera above the floor."""
-LEAN_STD = math.sin(math.radians(3))
-"""Standard deviation of a standing torso from the vertical, to each side."""
+LEAN_STD, SIDE_LEAN_STD = math.sin(math.radians(3)), math.sin(math.radians(1.5))
+"""Standard deviations of a standing torso from the vertical, forward and to the side, where people sway less."""
 BALANCE_STD_M = 0.03
 """Standard deviation of the centre of mass from above the line between the feet."""
 SOLE_STD_M = 0.015
@@ -69,8 +69,10 @@ def deviations(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v
         soles.append(points[..., 1].amin(1) + pose.translation[:, 1])
     left, right = soles
     torso = torch.nn.functional.normalize(_joint(places, "neck") - _joint(places, "pelvis"), dim=-1)
+    (x, z), (left_x, left_z) = torso[:, [0, 2]].T, torch.nn.functional.normalize(world_from_joint[:, 0, [0, 2], 0]).T
+    lean = torch.stack([(left_x * z - left_z * x) / LEAN_STD, (left_x * x + left_z * z) / SIDE_LEAN_STD])
     return torch.stack([
-        torso[:, [0, 2]].norm(dim=-1) / LEAN_STD,
+        lean.norm(dim=0),
         _beside_feet(places) / BALANCE_STD_M,
         (left - right) / SOLE_STD_M,
         (camera_height - torch.minimum(left, right) - HEIGHT_M) / HEIGHT_STD_M,
@@ -285,10 +287,11 @@ def _difference(
 
 
 @torch.no_grad()
-def outline_error(payload: Payload, target: PosedView) -> float:
-    """Mean squared difference of opacity."""
+def outline_error(payload: Payload, target: PosedView, blur: float = 0.0) -> float:
+    """Mean squared difference of opacity, after a blur whose standard deviation is a share of the picture's side."""
     drawn = march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha
-    return float((drawn - target.rgba[..., 3]).square().mean())
+    difference = (drawn - target.rgba[..., 3])[None]
+    return float(_blurred(difference, blur * max(difference.shape)).square().mean())
 
 
 def _encoded(rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 H W"]:

@@ -51,6 +51,8 @@ PATTERN_PX, HEAD_PX = 11, 3
 """Sides of the squares over which colours of the figure and of its head are compared, in the same pixels: patterns and
 faces are not drawn exactly.
 """
+LARGEST_DIFFERENCE, HEAD_SHARE = 0.1, 0.25
+"""Of encoded colour, where pictures of a person are compared, and how much the head counts besides."""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
 """How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {
@@ -149,12 +151,33 @@ def quality_of(
 
 
 @torch.no_grad()
-def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: float) -> FitQuality:
+def colour_error(payload: Payload, target: PosedView) -> float:
+    """Mean difference of encoded colour over the figure and over its head, of means over small squares.
+
+    A limb that is elsewhere is no worse than LARGEST_DIFFERENCE.
+    """
+    _, difference, inner = _compared(payload, target)
+    differs = _mean_around(difference, inner, HEAD_PX).abs().mean(-1)
+    head = _limbs_drawn(payload, target)["head"] * inner
+    of_head = float((head * differs).sum() / head.sum().clamp_min(1e-6))
+    return of_head * HEAD_SHARE + float(differs[inner].clamp_max(LARGEST_DIFFERENCE).mean()) if inner.any() else 1.0
+
+
+def _compared(
+    payload: Payload, target: PosedView
+) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+    """Opacity of the human drawn, its difference of encoded colour from the picture, and where both are opaque."""
     seen, opacity = march(Primitives.place(target.frames, payload), target.camera, COARSE), target.rgba[..., 3]
-    mask, drawn = opacity > 0.5, seen.alpha > 0.5
-    wrong = (mask & ~grown(drawn, EDGE_PX)) | (drawn & ~grown(mask, EDGE_PX))
     difference = encode_srgb(seen.rgb.clamp(1e-4, 1)) - encode_srgb(target.rgba[..., :3].clamp(1e-4, 1))
-    differs, inner = difference.abs().mean(-1), (opacity > 0.9) & (seen.alpha > 0.9)
+    return seen.alpha, difference, (opacity > 0.9) & (seen.alpha > 0.9)
+
+
+@torch.no_grad()
+def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: float) -> FitQuality:
+    (alpha, difference, inner), opacity = _compared(payload, target), target.rgba[..., 3]
+    mask, drawn = opacity > 0.5, alpha > 0.5
+    wrong = (mask & ~grown(drawn, EDGE_PX)) | (drawn & ~grown(mask, EDGE_PX))
+    differs = difference.abs().mean(-1)
     inside = _mean_around(difference, inner, PATTERN_PX).abs().mean(-1)[inner]
     of_head, outside, colour = _mean_around(difference, inner, HEAD_PX).abs().mean(-1), {}, {"head": 0.0}
     for limb, share in _limbs_drawn(payload, target).items():
@@ -171,7 +194,7 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
     return FitQuality(
         outline=float(wrong.sum() / (mask | drawn).sum()),
         colour=float(inside.quantile(0.9)) if len(inside) else 1.0,
-        unexplained=float(unexplained(seen.alpha, opacity).sum() / mask.sum()),
+        unexplained=float(unexplained(alpha, opacity).sum() / mask.sum()),
         left_out=left_out,
         outside=outside[limb],
         foot=foot,

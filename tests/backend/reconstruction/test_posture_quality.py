@@ -17,7 +17,14 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reconstruction.from_pictures import Found, fit_quality
 from primdiffusion.reconstruction.posture_fit import Posture
 from primdiffusion.reconstruction.posture_masks import without_things
-from primdiffusion.reconstruction.posture_quality import LEAST_PERCENT, LIMITS, FitQuality
+from primdiffusion.reconstruction.posture_quality import (
+    HEAD_SHARE,
+    LARGEST_DIFFERENCE,
+    LEAST_PERCENT,
+    LIMITS,
+    FitQuality,
+    colour_error,
+)
 from primdiffusion.reconstruction.posture_start import standing
 from primdiffusion.reconstruction.prior_fit import PriorFit
 from primdiffusion.render.image import PosedView
@@ -71,6 +78,23 @@ def test_a_whole_human_in_its_own_posture_fits_and_says_nothing():
     assert found.warnings() == []
     assert found.content()["percent"] == found.percent
     assert set(found.content()) == {"percent", "worst", *LIMITS}
+
+
+def test_a_head_counts_more_than_a_limb_that_is_elsewhere():
+    """The head's rows, and as many at the hips, get other colours; at the hips by far."""
+    _, target = seen()
+    rows = (target.rgba[..., 3] > 0.9).any(1).nonzero()[:, 0]
+    errors = {}
+    for first, change in ((0, 0.0), (0, 0.3), (len(rows) // 2, 0.3), (len(rows) // 2, 0.9)):
+        rgba = target.rgba.clone()
+        rgba[rows[first] : rows[first + len(rows) // 8], :, :3] += change
+        errors[first, change] = colour_error(PAYLOAD, dataclasses.replace(target, rgba=rgba))
+    same, head, hips, far = errors.values()
+    assert same < 0.01
+    assert hips - same == pytest.approx(far - same, rel=0.1)
+    assert hips - same < LARGEST_DIFFERENCE / 2
+    assert head > hips + HEAD_SHARE * LARGEST_DIFFERENCE
+    assert colour_error(PAYLOAD, dataclasses.replace(target, rgba=0 * target.rgba)) == 1.0
 
 
 def test_a_ball_is_left_out_whole_and_the_human_is_kept():
