@@ -198,7 +198,7 @@ def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, 
             pose = standing(*stance, turned=degrees)
             lens = photograph.lens() if view is None else view
             posture = Posture(pose, betas, framed([photograph], pose, betas, [lens]))
-            tried.append((outline_error(payload, *_targets([photograph], posture, OUTLINE_SIDE)), posture))
+            tried.append((outline_error(payload, _targets([photograph], posture, OUTLINE_SIDE)[0]), posture))
         found += sorted(tried, key=lambda one: one[0])[: 1 if turned else STANCES_TRIED]
     likely = [found[one][1] for one in _likely([error for error, _ in found], [0] * len(found), LIKELY_START)]
     return likely if view is None else [before_cameras(one, cameras_of([photograph], [view])) for one in likely]
