@@ -11,6 +11,9 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
+
+from primdiffusion.primitives.primitives import S
 
 ALIKE = 0.65
 """Least cosine of the patterns of two people who have the same print."""
@@ -22,6 +25,8 @@ CLEAR = 0.02
 """Share of voxels that are wholly in the first colour, and in the second."""
 LEAST_SHARE = 0.5
 """Of a voxel that a print is read in; others show too much of what is beside the garment."""
+UNSEEN = 0.01
+"""Voxels that count less, and whose neighbours do, are noise, which would be stored."""
 FAINT = 0.03
 """Boxes with less of the second colour are left out."""
 
@@ -86,6 +91,7 @@ def _print(value: Float[Tensor, "v"], counted: Float[Tensor, "v"], weight: Float
     mixed = ((value - first) / (second - first).clamp_min(1e-6)).clamp(0, 1)
     if (mixed * counted).sum() > 0.5:
         mixed = 1 - mixed
-    mixed = mixed.view_as(weight)
+    counts = functional.max_pool3d(weight.view(-1, 1, S, S, S), 3, stride=1, padding=1) > UNSEEN
+    mixed = mixed.view_as(weight) * counts.view_as(weight)
     shown = (mixed * weight).sum(1) > FAINT * weight.sum(1)
     return Print(shown.nonzero()[:, 0], mixed[shown])

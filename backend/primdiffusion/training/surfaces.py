@@ -187,7 +187,8 @@ class _People:
             others = {*self.vocabulary.categories.get("pattern", ())} - {*plain.values()} if plain else ()
             for pattern in sorted(others):
                 condition = whoever + self.vocabulary.encode({"pattern": pattern})
-                found.append(_Surface(condition, rows._replace(drawn=~rows.read), patterned=True))
+                if (self.condition @ condition >= condition.sum()).any():
+                    found.append(_Surface(condition, rows._replace(drawn=~rows.read), patterned=True))
         return found
 
     def even(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> bool:
