@@ -52,7 +52,7 @@ PATTERN_PX, HEAD_PX = 11, 3
 faces are not drawn exactly.
 """
 LARGEST_DIFFERENCE, HEAD_SHARE = 0.1, 0.25
-"""Of encoded colour, where pictures of a person are compared, and how much the head counts besides."""
+"""Largest difference of encoded colour that counts where pictures of a person are compared, and weight of the head."""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
 """How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {

@@ -23,8 +23,8 @@ FEWEST_GEOMETRIES = 4
 """With fewer people chance looks like a surface, or a print."""
 CLEAR = 0.02
 """Share of voxels that are wholly in the first colour, and in the second."""
-LEAST_SHARE = 0.5
-"""Of a voxel that a print is read in; others show too much of what is beside the garment."""
+OWN_SHARE = 0.5
+"""Least share of the garment by which a voxel's colour is divided: others show too much of what is beside it."""
 UNSEEN = 0.01
 """Voxels that count less, and whose neighbours do, are noise, which would be stored."""
 FAINT = 0.03
@@ -71,7 +71,7 @@ def find_prints(
         if len(geometry[same].unique()) >= FEWEST_GEOMETRIES:
             scores = torch.einsum("v,nvc->nc", _leading(centred[same].mT.flatten(0, 1)), centred[same])
             value = torch.einsum("nc,nvc->v", scores, differences[same]) / scores.square().sum().clamp_min(1e-12)
-            prints.append(_print(value / share.flatten().clamp_min(LEAST_SHARE), counted, weight))
+            prints.append(_print(value / share.flatten().clamp_min(OWN_SHARE), counted, weight))
     return prints
 
 
