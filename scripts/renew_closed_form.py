@@ -5,7 +5,7 @@
 
 People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
 for the closed form alone. The network keeps its weights for what has not changed. With `--surfaces-only` everything
-stays but the surfaces of one colour.
+stays but the surfaces of clothes that these people wear.
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ import dataclasses
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool, Float
 from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.codec import CellCodec
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.surfaces import Surfaces
 from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet, encode_people, split_people, vocabulary_of
@@ -35,7 +38,7 @@ def main() -> None:
     parser.add_argument("--more", type=Path, help="further people, of an earlier wardrobe")
     parser.add_argument("--without", nargs="*", default=["suit"], help="outfits of --more that are left out")
     parser.add_argument(
-        "--surfaces-only", action="store_true", help="find the surfaces of one colour and keep all else"
+        "--surfaces-only", action="store_true", help="find the surfaces of the people's outfits and keep all else"
     )
     parser.add_argument("--channels", type=int, default=96, help="leading latent channels of person components")
     parser.add_argument("--axes", type=int, default=64, help="principal axes of a covariance")
@@ -63,6 +66,8 @@ def main() -> None:
     config = PriorConfig(channels=arguments.channels, axes=arguments.axes)
     surfaces = fit_surfaces(latents, codec, vocabulary, config)
     if arguments.surfaces_only:
+        if base.surfaces is not None and surfaces is not None:
+            surfaces = with_clothes(base.surfaces, surfaces, outfits_of(latents, vocabulary, config))
         save_checkpoint(arguments.out, dataclasses.replace(base, surfaces=surfaces), str(base.card["schedule"]))
         return
     prior = fit_prior(latents, codec, vocabulary, config)
@@ -86,6 +91,46 @@ def joined(latents: LatentSet, more: LatentSet, used: Tensor) -> LatentSet:
         torch.cat([latents.betas, more.betas[geometry]]),
         torch.cat([latents.condition, more.condition[used]]),
         latents.detailed,
+    )
+
+
+def outfits_of(people: LatentSet, vocabulary: AttributeVocabulary, config: PriorConfig) -> Float[Tensor, "o a"]:
+    """Conditions of the outfits that these people wear."""
+    outfits = torch.stack(
+        [vocabulary.encode({config.outfit: outfit}) for outfit in vocabulary.categories[config.outfit]]
+    )
+    return outfits[(people.condition @ outfits.T > 0).any(0)]
+
+
+def with_clothes(base: Surfaces, renewed: Surfaces, outfits: Float[Tensor, "o a"]) -> Surfaces:
+    """The surfaces of `base`, but those of these outfits from `renewed`; below hair, hats and shoes."""
+    clothes = picked(renewed, (renewed.condition @ outfits.T > 0).any(1))
+    others = picked(base, ~(base.condition @ outfits.T > 0).any(1))
+    moved = dataclasses.replace(
+        others,
+        surface=others.surface + len(clothes.condition),
+        garment=others.garment + len(clothes.condition),
+        printed=others.printed + len(clothes.garment),
+        box=others.box + len(clothes.surface),
+    )
+    names = [field.name for field in dataclasses.fields(Surfaces)]
+    return Surfaces(*(torch.cat([getattr(clothes, name), getattr(moved, name)]) for name in names))
+
+
+def picked(surfaces: Surfaces, which: Bool[Tensor, "l"]) -> Surfaces:
+    """Some of the surfaces, with their boxes and prints."""
+    rows, prints = which[surfaces.surface], which[surfaces.garment]
+    printed = prints[surfaces.printed]
+    number, row, print_ = (mask.cumsum(0) - 1 for mask in (which, rows, prints))
+    return Surfaces(
+        surfaces.condition[which],
+        surfaces.natural[which],
+        number[surfaces.surface[rows]],
+        *(getattr(surfaces, name)[rows] for name in ("cell", "share", "tone", "read", "drawn")),
+        number[surfaces.garment[prints]],
+        print_[surfaces.printed[printed]],
+        row[surfaces.box[printed]],
+        surfaces.second[printed],
     )
 
 

@@ -4,9 +4,10 @@ import dataclasses
 
 import torch
 from diffusion_people import small_model
+from primdiffusion.diffusion.surfaces import Surfaces
 from primdiffusion.training.latents import LatentSet
 
-from scripts.renew_closed_form import joined, with_prior
+from scripts.renew_closed_form import joined, picked, with_clothes, with_prior
 
 
 def test_the_local_network_keeps_all_but_attributes_and_person_components():
@@ -39,3 +40,27 @@ def test_further_people_count_without_their_detail():
     assert both.geometry.tolist() == [0, 0, 1, 2, 3, 3, 4]
     assert len(both.betas) == 5
     assert both.detailed == 4
+
+
+def clothes(outfits, cells, printed):
+    """One surface on one box for each row of `outfits`, and prints on surfaces."""
+    count, prints = len(outfits), len(printed)
+    flags = torch.ones(count, dtype=torch.bool)
+    return Surfaces(
+        outfits, flags, torch.arange(count), torch.tensor(cells), torch.rand(count, 512), torch.rand(count, 512),
+        flags, flags, torch.tensor(printed), torch.arange(prints), torch.tensor(printed), torch.rand(prints, 512),
+    )  # fmt: skip
+
+
+def test_clothes_of_some_outfits_are_renewed_with_their_prints():
+    tee, suit, hair = torch.eye(3)
+    base = clothes(torch.stack([tee, suit, hair]), [1, 2, 3], [0, 1])
+    renewed = clothes(torch.stack([hair, tee, tee]), [4, 5, 6], [2, 1])
+    both = with_clothes(base, renewed, tee[None])
+    assert torch.equal(both.condition, torch.stack([tee, tee, suit, hair]))
+    assert both.cell.tolist() == [5, 6, 2, 3]
+    assert torch.equal(both.tone, torch.cat([renewed.tone[1:], base.tone[1:]]))
+    assert both.surface.tolist() == [0, 1, 2, 3]
+    assert both.garment.tolist() == both.box.tolist() == [1, 0, 2]
+    assert torch.equal(both.second[both.printed], torch.cat([renewed.second, base.second[1:]]))
+    assert all(torch.equal(getattr(picked(base, base.natural), name), value) for name, value in vars(base).items())

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.ndimage import binary_erosion, distance_transform_edt, gaussian_filter
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
 from primdiffusion.people import colours
 from primdiffusion.people.assets import Assets
@@ -89,12 +89,15 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
         seen = here & texels.inside
         if not seen.any():
             continue
-        if kind.smooth:
-            light = np.where(here, _blurred(light, seen), light)
-        if kind.trim and original is not None:
+        other = np.zeros_like(seen)
+        if original is not None and (kind.trim or kind.smooth):
             lab = lab_from_bytes(original[..., :3])
             distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.array([0.8, 1, 1], np.float64), axis=-1)
-            trim |= here & (distance > TRIM_DISTANCE)
+            other = here & (distance > TRIM_DISTANCE)
+        if kind.trim:
+            trim |= other
+        if kind.smooth:
+            light = np.where(here, _blurred(light, seen & ~binary_dilation(other, iterations=RIM)), light)
         for region in (here & ~trim, here & trim):
             if (region & texels.inside).any():
                 middle = np.median(light[region & texels.inside])

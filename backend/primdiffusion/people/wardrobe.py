@@ -26,9 +26,9 @@ class Piece:
 
     kind: Kind
     trim: bool = False
-    """The texture has parts of a clearly different colour (edgings, a shirt under a jacket), coloured separately."""
+    """The texture has parts of a clearly different colour (a shirt under a jacket), coloured separately."""
     smooth: bool = False
-    """The texture has fine stripes or text, which primitives cannot represent: only its smooth shading is used."""
+    """The texture has fine stripes or lettering, which primitives cannot represent: only its smooth shading is used."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,18 +50,18 @@ class Garment:
         return f"clothes/{self.mesh or self.name}/{self.mesh or self.name}"
 
 
-TRIMMED_TOP, SMOOTHED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")
+SMOOTHED_TOP, PLAIN_TOP = Piece("top", smooth=True), Piece("top")
 DENIM, DETAIL = Piece("denim"), Piece("detail")
 INNER_SHIRT = Piece("shirt", smooth=True)
 
 _SKIRT = (SMOOTHED_TOP, Piece("skirt"))
 UNISEX = (
-    Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
+    Garment("female_casualsuit01", (SMOOTHED_TOP, DENIM)),
     Garment("female_casualsuit02", (DENIM, PLAIN_TOP, DETAIL)),
     Garment("male_casualsuit01", (DENIM, PLAIN_TOP, DENIM, PLAIN_TOP, PLAIN_TOP, PLAIN_TOP), by_island=True),
-    Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
+    Garment("male_casualsuit02", (SMOOTHED_TOP, DENIM)),
     Garment("male_casualsuit03", (SMOOTHED_TOP, DENIM)),
-    Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
+    Garment("male_casualsuit04", (DENIM, SMOOTHED_TOP)),
     Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
     Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
     Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
@@ -73,7 +73,7 @@ OUTFITS: dict[Sex, tuple[Garment, ...]] = {
         *UNISEX,
         Garment("female_elegantsuit01", _SKIRT),
         Garment("female_elegantsuit01_long", _SKIRT, mesh="female_elegantsuit01", lengthened=1.45),
-        Garment("female_sportsuit01", (TRIMMED_TOP, Piece("tights", trim=True))),
+        Garment("female_sportsuit01", (SMOOTHED_TOP, Piece("tights", trim=True))),
     ),
     "male": UNISEX,
 }

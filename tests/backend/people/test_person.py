@@ -10,6 +10,7 @@ import trimesh
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.people import assets as assets_module
+from primdiffusion.people import garments
 from primdiffusion.people import payloads as payloads_module
 from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
@@ -24,6 +25,7 @@ from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.inverse import InverseSettings
 from primdiffusion.render.march import march
+from scipy.ndimage import binary_erosion, gaussian_filter
 from support.errors import refused
 
 SEEDS = range(4)
@@ -37,6 +39,16 @@ def base():
 @pytest.fixture(scope="module")
 def people(assets, base):
     return [make_person(assets, base, seed) for seed in SEEDS]
+
+
+@pytest.mark.parametrize("name", ["female_casualsuit01", "male_casualsuit02", "male_casualsuit04"])
+def test_tops_have_no_lettering(assets, base, name):
+    garment = next(each for each in OUTFITS["male"] if each.name == name)
+    fabric = garments.cloth(assets, base, garment)
+    top = fabric.piece == [piece.kind for piece in garment.pieces].index("top")
+    detail = np.abs(fabric.shade - gaussian_filter(fabric.shade, 6))[binary_erosion(top, iterations=12)]
+    assert np.quantile(detail, 0.99) < 0.12
+    assert not fabric.trim[top].any()
 
 
 def same_pictures(first, second):
@@ -231,7 +243,7 @@ def test_payloads_are_stored_whole_and_mended(assets, tmp_path, monkeypatch):
     monkeypatch.setattr(payloads_module, "fit_payload", lambda start, *_: start)
     monkeypatch.setattr(payloads_module, "fit_colours", with_density)
     monkeypatch.setattr(payloads_module, "_targets", lambda *_: [[]])
-    reports, method = [], f"fitted 3 from {load_checkpoint().card['sha256'][:12]}"
+    reports, method = [], f"fitted 4 from {load_checkpoint().card['sha256'][:12]}"
     (path,) = make_payloads(assets, tmp_path, 1, 2, 3, 1, report=lambda done, total: reports.append((done, total)))
     assert reports == [(0, 1), (1, 1)]
     with np.load(path, allow_pickle=False) as file:
