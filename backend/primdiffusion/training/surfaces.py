@@ -20,7 +20,7 @@ from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.surfaces import BRIGHTEST, DIMMEST, SURELY, Surfaces, seen, voxels_of
 from primdiffusion.editing.regions import region_of
-from primdiffusion.primitives.primitives import S
+from primdiffusion.primitives.primitives import GRID, S
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.prints import FEWEST_GEOMETRIES, Print, find_prints
@@ -49,6 +49,8 @@ UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
 LEAST_SHARE = 0.05
 """Of a voxel: less is chance."""
+SURROUNDED = 0.7
+"""Share of a box and its neighbours that a garment covers, above which the box is the garment's too."""
 FEWEST_BOXES = 24
 """Of a garment, or of skin: socks and collars are too few to tell from chance."""
 
@@ -168,9 +170,10 @@ class _People:
         boxes, parts, left = self.boxes[own], [skin & face], ~skin & ~region_of(("face", "hair", "hands"))
         while len(own) and (start := _largest(boxes, left)) is not None:
             garment = _covered(boxes, start, [boxes[:, part].mean(1) for part in parts], left)
-            left &= ~(start if garment is None else start | garment)
             if garment is not None:
+                garment |= _surrounded(garment) & left
                 parts.append(garment)
+            left &= ~(start if garment is None else start | garment)
         parts = [parts[0], *(part for part in parts[1:] if self.even(own, part))]
         if len(parts) == 1:
             return [_Surface(whoever, of_skin, natural=True)]
@@ -384,6 +387,12 @@ def _covered(
         if covered.sum() < FEWEST_BOXES:
             return None
     return covered
+
+
+def _surrounded(part: Bool[Tensor, "k"]) -> Bool[Tensor, "k"]:
+    """Boxes nearly all of whose neighbours on the grid are in the part: holes, where a few people wear a badge."""
+    around = functional.avg_pool2d(part.float().view(1, GRID, GRID), 3, stride=1, padding=1)
+    return around.flatten() > SURROUNDED
 
 
 def _largest(boxes: Float[Tensor, "n k 3"], left: Bool[Tensor, "k"]) -> Bool[Tensor, "k"] | None:

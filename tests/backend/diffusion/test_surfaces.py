@@ -11,7 +11,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import check_surfaces
 from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, Surfaces, voxels_of
 from primdiffusion.editing.regions import region_of
-from primdiffusion.primitives.primitives import K, S
+from primdiffusion.primitives.primitives import GRID, K, S
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.surfaces import fit_surfaces
@@ -196,6 +196,16 @@ def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
     assert torch.equal(skin.read, region_of(("face",))[skin.cell])
     assert torch.equal(skin.drawn, ~skin.read)
     assert not any(region_of(("thighs",))[each.cell].any() for each in garments)  # fades are no chance
+
+
+def test_a_box_in_the_middle_of_a_garment_is_the_garments(people, codec):
+    top = region_of(TOP)
+    inner = (torch.nn.functional.avg_pool2d(top.float().view(1, GRID, GRID), 3, 1, 1) == 1).flatten().nonzero()[0, 0]
+    latents = people.latents.flatten(2).clone()
+    latents[..., inner] = latents[..., inner].roll(COLOURINGS + 1, 0)  # a badge in another colour on everybody
+    others = dataclasses.replace(people, latents=latents.view_as(people.latents))
+    garments = rows_of(fit_surfaces(others, codec, WORDS, PriorConfig()), outfit="tee", pattern="plain")
+    assert any(torch.equal(over(each.read, each.cell), top) for each in garments)
 
 
 def test_a_suit_of_one_cloth_is_one_surface(surfaces):
