@@ -65,10 +65,8 @@ def test_a_model_stays_loaded_until_another_is_asked_for(tmp_path, monkeypatch, 
 
 def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
     request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=32)
-    stages = []
-    generate(request, Session(), lambda *report: stages.append(report[0]))
-    assert stages == ["load", "sample", "sample", "sample", "write", "write"]
-    ended_at_each_report(lambda report: generate(request, Session(), report), tmp_path / "out")
+    _, reports = ended_at_each_report(lambda report: generate(request, Session(), report), tmp_path / "out")
+    assert [report[0] for report in reports] == ["load", "sample", "sample", "sample", "write", "write"]
 
 
 def test_nothing_is_written_through_a_link_in_the_folder_of_several_humans(tmp_path):
