@@ -19,7 +19,7 @@ from .body import Body
 from .scan import Scan
 from .scan_files import ScanFile
 from .settings import CaptureSettings
-from .stage import Stage
+from .stage import CaptureScene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ def place_group(
         rotations = np.roll(poses.rotations, -first, axis=0)
         rotations[:, 0] = _about_the_vertical(yaw) @ rotations[:, 0]
         own.append(rotations)
-        with contextlib.closing(Stage(context, settings)) as stage, stage.entered() as inside:
+        with contextlib.closing(CaptureScene(context, settings)) as stage, stage.entered() as inside:
             scan = load(inside, scan_file, body)
             pelvis.append([scan.pose(rotation, np.zeros(3))[0] for rotation in rotations])
             extents.append([_extent(scan, *pose) for pose in zip(rotations, pelvis[-1], strict=True)])

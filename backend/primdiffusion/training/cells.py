@@ -27,7 +27,7 @@ from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
-from primdiffusion.training.loop import Step
+from primdiffusion.training.loop import TrainingStep
 from primdiffusion.training.losses import RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.surfaces import fit_surfaces
@@ -155,7 +155,7 @@ class CellTask(DiffusionTask):
         fast = self.settings.bfloat16 and has_fast_bfloat16(self.device)
         self.denoiser.network_dtype = torch.bfloat16 if fast else torch.float32
 
-    def loss(self, step: Step) -> Mapping[str, Tensor]:
+    def loss(self, step: TrainingStep) -> Mapping[str, Tensor]:
         """Weighted x0 error of a random batch at random levels."""
         return {"loss": self.objective.loss(step.generator)}
 

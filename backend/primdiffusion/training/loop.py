@@ -45,7 +45,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
+class TrainingStep:
     """One optimiser step, as its loss sees it."""
 
     number: int
@@ -93,7 +93,7 @@ class Task(ABC):
         return adamw(self.settings, network.parameters())
 
     @abstractmethod
-    def loss(self, step: Step) -> Mapping[str, Tensor]:
+    def loss(self, step: TrainingStep) -> Mapping[str, Tensor]:
         """Return the weighted terms of the objective on a random batch."""
 
     @abstractmethod
@@ -171,7 +171,7 @@ def take_step(task: Task, seed: int, state: TrainingState) -> StepMetrics:
     generator, began = torch.Generator(device).manual_seed(seed), time.perf_counter()
     state.prepared.train()
     with _memory_named(task):
-        terms = task.loss(Step(state.step, generator, state.place))
+        terms = task.loss(TrainingStep(state.step, generator, state.place))
         values = {name: float(term.detach()) for name, term in terms.items()}
         if bad := [name for name, value in values.items() if not math.isfinite(value)]:
             raise ValueError(

@@ -24,7 +24,7 @@ from primdiffusion.render.merge import merge as merge_boxes
 from primdiffusion.runtime.failures import MissingPackageError
 from support.tiny import tiny_model
 
-COARSE = ["--triangles", "800", "--texture", "64"]
+COARSE = ["--triangles", "800", "--texture", "64", "--spacing", "0.03"]
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_what_cannot_be_exported_is_rejected_before_any_work(saved, monkeypatch,
 
 
 def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
-    params = {"person": saved, "triangles": 800, "texture_px": 64, "spacing": 0.02}
+    params = {"person": saved, "triangles": 800, "texture_px": 64, "spacing": 0.03}
     own = proxy(ProxyRequest(out_dir=tmp_path / "own", **params), Session(), silent)
     tall = proxy(ProxyRequest(out_dir=tmp_path / "tall", betas=[3.0] + [0.0] * 9, **params), Session(), silent)
     heights = []

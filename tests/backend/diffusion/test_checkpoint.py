@@ -306,8 +306,8 @@ def test_a_saved_folder_loads_as_the_same_model(tmp_path):
     assert "# Model card: tiny" in card
 
 
-def test_the_readme_is_the_card_of_the_default_checkpoint(tmp_path):
-    folder = save_pretrained(load_checkpoint(), tmp_path / "default")
+def test_the_readme_is_the_card_of_the_default_checkpoint(default, tmp_path):
+    folder = save_pretrained(default, tmp_path / "default")
     card = (folder / "README.md").read_text()
     assert "license: cc0-1.0" in card
     assert card.split("---\n", 2)[2].split("sha256")[0] == model_card(read_card()).split("sha256")[0]

@@ -27,7 +27,7 @@ from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.diffusion_task import SlabTask
-from primdiffusion.training.loop import Interrupt, Step, step_seed
+from primdiffusion.training.loop import Interrupt, TrainingStep, step_seed
 from primdiffusion.training.losses import LEVELS
 from support.errors import refused
 from support.runs import child_environment, rows, same_tensors, sentence, timeless
@@ -75,7 +75,7 @@ def after(steps):
 
 
 def first_step():
-    return Step(0, torch.Generator().manual_seed(0), {})
+    return TrainingStep(0, torch.Generator().manual_seed(0), {})
 
 
 def test_a_run_leaves_settings_people_metrics_pictures_states_and_a_model(people, whole):
