@@ -27,7 +27,7 @@ ENDINGS = (".human.safetensors", ".human")
 OWN_FOLDER = ("person.human.safetensors", "person.glb")
 """Names of files in folders of their own: Blender's generated humans, and those of `primdiffusion people`."""
 PATTERNS = (*(f"*{ending}" for ending in ENDINGS), *(f"*/{name}" for name in OWN_FOLDER))
-"""Where humans are in a folder."""
+"""Patterns of the files of humans in a folder."""
 PASSES = ("img", "mask", "depth")
 """Passes that volumes have."""
 VISIBLE = 0.03
@@ -142,7 +142,7 @@ def is_generated(path: Path) -> bool:
 
 
 def renderer_name(paths: Sequence[Path]) -> str:
-    """What draws the humans of these files, as dataset.json names it."""
+    """Renderer of the humans of these files, as dataset.json names it."""
     generated = {is_generated(path) for path in paths}
     return " and ".join(name for kind, name in ((False, "rasteriser"), (True, "marcher")) if kind in generated)
 

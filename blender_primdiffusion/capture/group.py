@@ -29,7 +29,7 @@ class Placed:
     poses: Motion
     """Its own, at its places."""
     views: list[View]
-    """Of all of the group."""
+    """Views of the whole group."""
     first: str
     """Name of the first of the group, whose seeds choose the HDRIs."""
 

@@ -80,7 +80,7 @@ WATCH_S = 0.25
 _MOST_LINES = 200
 """Lines kept of what the steps have said."""
 _PRINT_S = 1.0
-"""Between lines of progress on the console in background mode."""
+"""Seconds between lines of progress on the console in background mode."""
 
 
 class Reporting:

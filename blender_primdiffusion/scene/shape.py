@@ -23,7 +23,7 @@ SHARE = 0.5
 SAME_BETAS = 1e-5
 """Betas that differ by less are the same shape."""
 DENSITY = 985.0
-"""Of a living body with air in the lungs, kg/m^3."""
+"""Density of a living body with air in the lungs, kg/m^3."""
 MOST_CORRECTIONS = 20
 _TOLERANCE = np.array([1e-4, 1e-2])
 """Metres, kilograms."""

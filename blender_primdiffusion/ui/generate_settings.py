@@ -30,7 +30,7 @@ _LONGEST_TEXT = 1 << 16
 _LARGEST_NUMBER = 1e9
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
-"""Those with a menu."""
+"""Attributes with a menu."""
 SCALARS = {"height": "m", "weight": "kg"}
 _DEFAULT_CHECKPOINT = Path("primdiffusion", "weights", "default.safetensors")
 

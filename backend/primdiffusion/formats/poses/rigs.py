@@ -127,7 +127,7 @@ _LISTED = 36
 
 @dataclasses.dataclass(frozen=True)
 class BoneMap:
-    """Which bone of a rig is which joint."""
+    """Bones of a rig by SMPL's joints."""
 
     rig: str
     """A key of `RIGS`."""
