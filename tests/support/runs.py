@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from safetensors.torch import load_file
 
 _TESTS = Path(__file__).parents[1]
@@ -31,7 +31,7 @@ def child_environment() -> dict[str, str]:
 
 def sentence(error: BaseException) -> str:
     """What the command line would print of an error; a defect has none."""
-    failure = describe(error)
+    failure = to_user_error(error)
     assert failure is not None
     assert "\n" not in str(failure)
     return str(failure)

@@ -48,7 +48,7 @@ voxels (2 to 14 mm) at eight times the memory."""
 LARGEST_SEED = 2**63 - 1
 
 Seed = Annotated[int, Range(0, LARGEST_SEED)]
-Share = Annotated[float, Range(0, 1)]
+Fraction = Annotated[float, Range(0, 1)]
 Pixels = Annotated[int, Range(1, 65_536)]
 StepPixels = Annotated[int, Range(0, 1024), Option(hidden=True)]
 """Larger previews would delay sampling and cancelling."""
@@ -151,7 +151,7 @@ class VariationsRequest(Sampling, Conditioning):
     """Width and height of the previews, pixels."""
     person: Path | None = None
     """A .human.safetensors file: generate variants of this human, as `vary` does, instead of new humans."""
-    amount: Share = 0.5
+    amount: Fraction = 0.5
     """Difference of the variants from this human: 0 none, 1 almost complete."""
 
     def check(self) -> None:
@@ -180,7 +180,7 @@ class EditRequest(StepPreviews):
 class VaryRequest(EditRequest, Conditioning):
     """Generate a variant of a human: the same body with other clothes and another face."""
 
-    amount: Share = 0.5
+    amount: Fraction = 0.5
     """Difference of the new human from this one: 0 none, 1 almost complete."""
     seed: Seed = 0
     """Another seed gives another result; the same seed gives the same result."""
@@ -192,7 +192,7 @@ class InterpolateRequest(EditRequest):
 
     other: Person
     """A second .human.safetensors file."""
-    fraction: Share = 0.5
+    fraction: Fraction = 0.5
     """Fraction of the other human: 0 is exactly this human, 1 exactly the other."""
 
     def check(self) -> None:
@@ -235,7 +235,7 @@ class TransferRequest(RegionRequest):
     """A .human.safetensors file to copy from."""
     what: Transfer = "texture"
     """texture: colours only, for garments of the same cut; garment: shape too."""
-    harmonise: Share = 0.0
+    harmonise: Fraction = 0.0
     """How much the region is denoised again to match the rest of the human: 0 copies it exactly."""
 
 

@@ -64,7 +64,7 @@ PICTURE_REMEDY = "choose a smaller resolution, or close other programs, then try
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
 
 
-def describe(error: BaseException) -> ErrorDescription | None:
+def to_user_error(error: BaseException) -> ErrorDescription | None:
     """Return the description of a domain error, or None for a bug. It holds no terminal escapes of a file."""
     found = _described(error)
     return None if found is None else dataclasses.replace(found, sentence=printable(found.sentence))

@@ -16,7 +16,7 @@ from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.march import MarchSettings
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from support.tiny import tiny_model
 
 WIDTH, HEIGHT = 40, 56
@@ -145,7 +145,7 @@ def test_out_of_memory_names_the_resolution(params, monkeypatch):
     monkeypatch.setattr(frame_drawer, "draw_in_bands", no_room)
     with pytest.raises(MemoryError, match=f"{WIDTH} x {HEIGHT} pixels") as error:
         drawn(params)
-    failure = describe(error.value)
+    failure = to_user_error(error.value)
     assert (failure.kind, "resolution" in failure.remedy) == ("out_of_memory", True)
 
 
