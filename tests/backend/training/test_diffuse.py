@@ -300,7 +300,7 @@ def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypat
 )
 def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
     given = {"steps": 1, "batch": 1} if settings_of is NetworkTraining else {"data": Path("a"), "run": Path("b")}
-    with pytest.raises(ValueError, match=word):
+    with refused(ValueError, word):
         settings_of(**{**given, **changes})
 
 
