@@ -149,7 +149,7 @@ class CellTask(DiffusionTask):
         assert self.denoiser.local is not None
         return self.denoiser.local
 
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Install a network, in the precision of its settings."""
         self.denoiser.local = network
         fast = self.settings.bfloat16 and has_fast_bfloat16(self.device)

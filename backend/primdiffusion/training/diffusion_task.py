@@ -124,7 +124,7 @@ class SlabTask(DiffusionTask):
         """Return the U-Net."""
         return self.denoiser
 
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Use a network as the denoiser."""
         self.denoiser = network
 

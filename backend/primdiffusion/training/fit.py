@@ -110,7 +110,7 @@ class EncoderTask(Task):
         torch.manual_seed(self.config.seed)
         return Encoder(self.config.architecture)
 
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Use an encoder."""
         self.encoder = network
 

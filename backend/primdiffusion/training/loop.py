@@ -85,7 +85,7 @@ class Task(ABC):
         """Return the network as initialised."""
 
     @abstractmethod
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Use this network from now on: the one in training, or its average."""
 
     def optimiser(self, network: nn.Module) -> torch.optim.Optimizer:
@@ -147,7 +147,7 @@ def _train(
         if recorder is not None and state.step > saved:
             _save(task, state, path)
     accelerator.wait_for_everyone()
-    task.put(state.average)
+    task.use_network(state.average)
     return state
 
 
@@ -156,7 +156,7 @@ def begin_training(task: Task, accelerator: Accelerator) -> TrainingState:
     with _memory_named(task):
         network = task.network().requires_grad_(True).to(accelerator.device)
         state = TrainingState(network, task.settings, accelerator, task.optimiser(network))
-    task.put(state.prepared)
+    task.use_network(state.prepared)
     return state
 
 
@@ -250,11 +250,11 @@ class Recorder:
 
     @contextlib.contextmanager
     def _averaged(self) -> Iterator[None]:
-        self.task.put(self.state.average)
+        self.task.use_network(self.state.average)
         try:
             yield
         finally:
-            self.task.put(self.state.prepared)
+            self.task.use_network(self.state.prepared)
 
     def _write(self, values: Mapping[str, float]) -> None:
         step, steps = self.state.step, self.task.settings.steps
