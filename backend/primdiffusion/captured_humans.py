@@ -114,14 +114,14 @@ def find_subjects(path: str | Path) -> dict[str, Path]:
 
     Raises:
         FileNotFoundError: the folder does not exist or contains none.
-        ValueError: two files have one name, or that of the file is no name of a subject.
+        ValueError: two files have one name, or the name of a file is not that of a subject.
     """
     path = Path(path)
     if path.is_file():
         name = _name(path)
         if is_generated(path) and SUBJECT_NAME.fullmatch(name):
             return {name: path}
-        raise ValueError(f"{path} is no human to capture: choose a folder, or NAME.human of letters, digits and . _ -")
+        raise ValueError(f"{path} cannot be captured: choose a folder, or NAME.human of letters, digits and . _ -")
     found: dict[str, Path] = {}
     for file in sorted(file for pattern in PATTERNS for file in path.glob(pattern)):
         name = _name(file)

@@ -59,7 +59,7 @@ JsonId = str | int | float | None
 class RpcError(Exception):
     """The error of a response: a code, one sentence, and data for programs.
 
-    Of a line that is no request, `id` is the request's if it could be read, as JSON-RPC requires.
+    Of a line that is not a request, `id` is the request's if it could be read, as JSON-RPC requires.
     """
 
     def __init__(self, code: int, message: str, data: dict[str, Any] | None = None, *, id: JsonId = None):

@@ -185,7 +185,7 @@ class BackendClient:
 
     @property
     def stderr(self) -> tuple[str, ...]:
-        """The last lines the child wrote to stderr, and lines on stdout that are no messages."""
+        """The last lines the child wrote to stderr, and lines on stdout that are not messages."""
         errors = self._last_errors if self._errors is None else self._errors.log()
         return (*self._stray, *errors)
 

@@ -268,7 +268,7 @@ def _unit(vectors: NDArray) -> NDArray[np.float64]:
 
 
 def betas_of(person: bpy.types.Object) -> NDArray[np.float64]:
-    """The human's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
+    """The human's shape [10] as the engine draws it now. Raises ValueError where it is not a list of ten numbers."""
     if BETAS not in person:
         return generated_betas(person)
     betas = stored_numbers(person, BETAS, BETA_COUNT)

@@ -101,7 +101,7 @@ def load_base(path: Path) -> DiffusionModel:
     """Load a checkpoint to go on from. Raises ValueError unless it is of the default preset; FileNotFoundError."""
     model = load_checkpoint(path)
     if not isinstance(model.denoiser, PersonDenoiser) or model.denoiser.local is None:
-        raise ValueError(f"{path} is no checkpoint of the default preset: give another --start-from")
+        raise ValueError(f"{path} is not a checkpoint of the default preset: give another --start-from")
     return model
 
 
