@@ -24,7 +24,7 @@ from record import command_line, report
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = ROOT / "tests"
 sys.path[:0] = [
-    str(TESTS / folder) for folder in (".", "backend", "backend/released", "backend/evaluation")
+    str(TESTS / folder) for folder in (".", "backend", "backend/released", "backend/evaluation", "backend/diffusion")
 ]  # the references
 
 import test_metrics_torch_fidelity  # noqa: E402

@@ -57,7 +57,7 @@ ATTACKS = (
     "tests/backend/runtime/test_worker_process.py::test_a_link_in_place_of_the_lock_is_named_and_its_target_stays",
     "tests/backend/training/test_run_folder.py::test_nothing_is_written_through_a_link_in_a_strangers_run_folder",
     "tests/blender/scene/test_blend_values.py::test_a_record_is_parsed_once_however_often_panels_draw",
-    "tests/blender/ui/test_attributes.py::test_a_checkpoint_that_is_damaged_or_claims_much_is_read_once",
+    "tests/blender/ui/test_generate_settings.py::test_a_checkpoint_that_is_damaged_or_claims_much_is_read_once",
     "tests/blender/ui/test_captures_panel.py::test_paths_that_begin_with_a_hyphen_are_no_options",
 )
 """Tests whose inputs are attacks."""

@@ -27,7 +27,7 @@ ENDINGS = (".human.safetensors", ".human")
 OWN_FOLDER = ("person.human.safetensors", "person.glb")
 """Names of files in folders of their own: Blender's generated humans, and those of `primdiffusion people`."""
 PATTERNS = (*(f"*{ending}" for ending in ENDINGS), *(f"*/{name}" for name in OWN_FOLDER))
-"""Where humans are in a folder."""
+"""Patterns of the files of humans in a folder."""
 PASSES = ("img", "mask", "depth")
 """Passes that volumes have."""
 VISIBLE = 0.03
@@ -114,14 +114,14 @@ def find_subjects(path: str | Path) -> dict[str, Path]:
 
     Raises:
         FileNotFoundError: the folder does not exist or contains none.
-        ValueError: two files have one name, or that of the file is no name of a subject.
+        ValueError: two files have one name, or the name of a file is not that of a subject.
     """
     path = Path(path)
     if path.is_file():
         name = _name(path)
         if is_generated(path) and SUBJECT_NAME.fullmatch(name):
             return {name: path}
-        raise ValueError(f"{path} is no human to capture: choose a folder, or NAME.human of letters, digits and . _ -")
+        raise ValueError(f"{path} cannot be captured: choose a folder, or NAME.human of letters, digits and . _ -")
     found: dict[str, Path] = {}
     for file in sorted(file for pattern in PATTERNS for file in path.glob(pattern)):
         name = _name(file)
@@ -142,7 +142,7 @@ def is_generated(path: Path) -> bool:
 
 
 def renderer_name(paths: Sequence[Path]) -> str:
-    """What draws the humans of these files, as dataset.json names it."""
+    """Renderer of the humans of these files, as dataset.json names it."""
     generated = {is_generated(path) for path in paths}
     return " and ".join(name for kind, name in ((False, "rasteriser"), (True, "marcher")) if kind in generated)
 

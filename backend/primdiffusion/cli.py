@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from primdiffusion.commands.options import OPTIONS
-from primdiffusion.runtime.failures import describe, traceback_of
+from primdiffusion.runtime.failures import to_user_error, traceback_of
 from primdiffusion.runtime.machine import DEVICES, choose_device, share_processors
 from primdiffusion.version import __version__
 
@@ -138,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except BrokenPipeError:
         _end(1)
     except Exception as e:
-        failure = describe(e)
+        failure = to_user_error(e)
         if failure is None or TRACEBACK in given:
             with contextlib.suppress(BrokenPipeError):
                 print(traceback_of(e), end="", file=sys.stderr)

@@ -193,7 +193,7 @@ def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> I
 
 
 def draw_into(picture: Image, scene: Scene, camera: Camera, look: ViewSettings) -> float:
-    """As `draw`, into an existing picture of the camera's size; return the seconds spent in the marcher."""
+    """Draw as `draw` into an existing picture of the camera's size; return the seconds spent in the marcher."""
     check_camera(camera)
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
     end = None if behind is None else behind.end

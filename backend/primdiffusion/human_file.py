@@ -52,7 +52,7 @@ _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
 """Tensors of a .human.safetensors file."""
 _EXTENTS = {"rest_half_extent": (K, 3)}
-"""Those of a human on a body of the user's files."""
+"""Further arrays of a human on a body of the user's files, and their shapes."""
 _KNOWN = (*SHAPES, *_EXTENTS)
 """Whatever else a file holds, such as a motion, is not read."""
 

@@ -31,7 +31,7 @@ from primdiffusion.files.regular_files import printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import FieldError, read, written
-from primdiffusion.runtime.failures import describe, shortened, traceback_of
+from primdiffusion.runtime.failures import shortened, to_user_error, traceback_of
 from primdiffusion.runtime.machine import memory, share_processors
 from primdiffusion.version import __version__
 
@@ -59,7 +59,7 @@ JsonId = str | int | float | None
 class RpcError(Exception):
     """The error of a response: a code, one sentence, and data for programs.
 
-    Of a line that is no request, `id` is the request's if it could be read, as JSON-RPC requires.
+    Of a line that is not a request, `id` is the request's if it could be read, as JSON-RPC requires.
     """
 
     def __init__(self, code: int, message: str, data: dict[str, Any] | None = None, *, id: JsonId = None):
@@ -319,7 +319,7 @@ def _as_rpc_error(error: Exception) -> RpcError:
     if isinstance(error, RpcError):
         return error
     print(traceback_of(error), end="", file=sys.stderr, flush=True)
-    failure = describe(error)
+    failure = to_user_error(error)
     if failure is None:
         sentence = printable(f"defect in the backend: {type(error).__name__}: {error}")
         remedy = "report it with the lines of the backend's log"

@@ -61,7 +61,7 @@ BLENDER = (
 NEVER = ("PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_USER", "PIP_PYTHON", "CUDA_INJECTION64_PATH")
 """Names that a pattern above contains, but that would install elsewhere or load a library into the process."""
 READ_BYTES = 1 << 18
-"""Of a child's output, taken in at once."""
+"""Largest piece of a child's output read at once, bytes."""
 LONGEST_LINE = 1 << 22
 """Longer ones, which take too long to parse, are dropped; see `Output.lost_message`."""
 LOG_BYTES = 1 << 16

@@ -31,7 +31,7 @@ SILENCE_S = 20.0
 LONGEST_POLL_GAP_S = 1.0
 """Silence counts only while we poll: a suspended laptop or a blocked Blender is not the child's fault."""
 POLL_S = 0.05
-"""Of parsing in one call of `poll`: a flood of messages is taken in over several."""
+"""Longest parsing in one call of `poll`, seconds: a flood of messages is taken in over several."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,7 @@ class BackendClient:
         silence_s: float = SILENCE_S,
     ):
         self.python = python
-        """Of the child, or its program."""
+        """The child's Python, or its program."""
         self._command = [str(python), "serve"] if is_program(python) else [str(python), "-m", f"{PROGRAM}.serve"]
         self._environment = child_environment(module_path, cache_dir, env or {})
         self._silence_s = silence_s
@@ -185,7 +185,7 @@ class BackendClient:
 
     @property
     def stderr(self) -> tuple[str, ...]:
-        """The last lines the child wrote to stderr, and lines on stdout that are no messages."""
+        """The last lines the child wrote to stderr, and lines on stdout that are not messages."""
         errors = self._last_errors if self._errors is None else self._errors.log()
         return (*self._stray, *errors)
 

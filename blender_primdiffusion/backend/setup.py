@@ -33,7 +33,7 @@ OFFLINE = (
 )
 _TRIAL = {"seed": 0, "steps": 3, "size": 16}
 _DOWNLOADED, _INSTALLED = 0.6, 0.9
-"""Of the bar, when these are done."""
+"""Fractions of the progress bar at which these are done."""
 _VENV = ("-I", "-m", "venv", "--clear")
 _INSTALL = (
     "install", "--require-hashes", "--no-deps", "--only-binary", ":all:", "--no-compile", "--no-warn-script-location",

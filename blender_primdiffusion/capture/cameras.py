@@ -31,7 +31,7 @@ AWAY_M, HEIGHT_M = 4.0, 0.95
 def aim(camera: bpy.types.Object, view: View) -> tuple[float, float]:
     """Make a camera object see what `view` does; returns the pixels' aspect (x, y) that the scene must have.
 
-    Raises ValueError for pixels that are no rectangles.
+    Raises ValueError for pixels that are not rectangles.
     """
     k, data = view.intrinsics, camera.data
     if abs(k[0, 1]) > 1e-9 * k[0, 0]:

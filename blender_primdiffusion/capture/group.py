@@ -19,7 +19,7 @@ from .body import Body
 from .scan import Scan
 from .scan_files import ScanFile
 from .settings import CaptureSettings
-from .stage import Stage
+from .stage import CaptureScene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Placed:
     poses: Motion
     """Its own, at its places."""
     views: list[View]
-    """Of all of the group."""
+    """Views of the whole group."""
     first: str
     """Name of the first of the group, whose seeds choose the HDRIs."""
 
@@ -54,7 +54,7 @@ def place_group(
         rotations = np.roll(poses.rotations, -first, axis=0)
         rotations[:, 0] = _about_the_vertical(yaw) @ rotations[:, 0]
         own.append(rotations)
-        with contextlib.closing(Stage(context, settings)) as stage, stage.entered() as inside:
+        with contextlib.closing(CaptureScene(context, settings)) as stage, stage.entered() as inside:
             scan = load(inside, scan_file, body)
             pelvis.append([scan.pose(rotation, np.zeros(3))[0] for rotation in rotations])
             extents.append([_extent(scan, *pose) for pose in zip(rotations, pelvis[-1], strict=True)])

@@ -42,7 +42,7 @@ from .passes import write_passes
 from .scan import Scan, load_scan
 from .scan_files import ScanFile
 from .settings import CaptureSettings
-from .stage import Stage, shoot_centres, shoot_colours
+from .stage import CaptureScene, shoot_centres, shoot_colours
 from .surfaces import mark_parts, prepare_materials
 
 
@@ -201,7 +201,7 @@ def _capture(
     context, settings, scan_file, placed: Placed, body, load, clock: _Clock
 ) -> Generator[CaptureProgress, None, None]:
     folder, poses = settings.out / scan_file.name, placed.poses
-    with contextlib.closing(Stage(context, settings)) as stage:
+    with contextlib.closing(CaptureScene(context, settings)) as stage:
         clock.note_once(stage.device_note)
         with stage.entered() as own:
             scan = load(own, scan_file, body)
@@ -239,7 +239,7 @@ def _views_around(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[
     return settings.rig.views(*bounding_sphere(scan.bounds(poses.rotations, poses.translations)))
 
 
-def _shoot(stage: Stage, settings: CaptureSettings, folder: Path, view: View, where: tuple[int, int]) -> None:
+def _shoot(stage: CaptureScene, settings: CaptureSettings, folder: Path, view: View, where: tuple[int, int]) -> None:
     seed = view_seed(settings.seed, folder.name, *where)
     kinds = settings.kinds
     colours = shoot_colours(stage, view, seed, settings.samples) if set(kinds) - _CENTRE_PASSES else None

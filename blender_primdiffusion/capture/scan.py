@@ -42,7 +42,7 @@ _POOR_FIT_M = 0.05
 _EXACT_M = 0.001
 _T_REST_DEG = 10.0
 _ROUNDS = 2
-"""Of fitting the shape and turning the limbs to that shape's rest."""
+"""Rounds of fitting the shape and turning the limbs to that shape's rest."""
 _OWN_NAMES = {name: name for name in JOINT_NAMES}
 
 

@@ -88,7 +88,7 @@ _LAYERS = 256
 """Transparent surfaces along a ray: hair has many layers."""
 
 
-class Stage:
+class CaptureScene:
     """A scene with a camera, lights and Cycles' settings; `close` removes all of it."""
 
     def __init__(self, context: bpy.types.Context, settings: CaptureSettings):
@@ -197,14 +197,14 @@ _NARROWEST_PX = 0.01
 """Cycles' narrowest filter: rays within 0.02 px of the pixel's centre."""
 
 
-def shoot_colours(stage: Stage, view: View, seed: int, samples: int) -> Colours:
+def shoot_colours(stage: CaptureScene, view: View, seed: int, samples: int) -> Colours:
     """Colours and coverage, averaged over each pixel by a box of its size. Raises RuntimeError."""
     cycles = stage.scene.cycles
     cycles.pixel_filter_type, cycles.samples = "BOX", samples
     return read_colours(_render(stage, view, seed))
 
 
-def shoot_centres(stage: Stage, view: View, seed: int) -> Centres:
+def shoot_centres(stage: CaptureScene, view: View, seed: int) -> Centres:
     """What the rays through the pixels' centres hit. Raises RuntimeError."""
     cycles = stage.scene.cycles
     denoise, cycles.use_denoising = cycles.use_denoising, False
@@ -215,7 +215,7 @@ def shoot_centres(stage: Stage, view: View, seed: int) -> Centres:
         cycles.use_denoising = denoise
 
 
-def _render(stage: Stage, view: View, seed: int) -> Path:
+def _render(stage: CaptureScene, view: View, seed: int) -> Path:
     scene, render, path = stage.scene, stage.scene.render, stage.scratch / "view.exr"
     render.resolution_x, render.resolution_y = view.width, view.height
     render.pixel_aspect_x, render.pixel_aspect_y = aim(stage.camera, view)

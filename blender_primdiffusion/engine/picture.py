@@ -123,8 +123,8 @@ def posed_humans(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | 
     """All humans whose armature is visible, in a viewport where one is given; instances included.
 
     An armature represents its human, which is hidden with it and drawn wherever it is instanced, unless scaled to zero.
-    Raises FileNotFoundError for a human whose file is missing, and ValueError for a shape that is no list of numbers or
-    a pose that holds NaN.
+    Raises FileNotFoundError for a human whose file is missing, and ValueError for a shape that is not a list of numbers
+    or a pose that holds NaN.
     """
     return [pose_of(armature, matrix) for armature, matrix in human_armatures(visible_instances(depsgraph, space))]
 
@@ -173,7 +173,7 @@ def _betas(armature: bpy.types.Object) -> list[float] | None:
 
 
 UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "POINTCLOUD", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
-"""Types of objects that are no solids; their children report changes of their own."""
+"""Types of objects that are not solids; their children report changes of their own."""
 _SOLID_DATA = (
     bpy.types.Mesh,
     bpy.types.Curve,

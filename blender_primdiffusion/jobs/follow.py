@@ -78,9 +78,9 @@ def _leave_edit_mode(context: bpy.types.Context) -> bool:
 TICK_S = 0.1
 WATCH_S = 0.25
 _MOST_LINES = 200
-"""Of what a session has said."""
+"""Lines kept of what the steps have said."""
 _PRINT_S = 1.0
-"""Between lines of progress on the console in background mode."""
+"""Seconds between lines of progress on the console in background mode."""
 
 
 class Reporting:
@@ -183,7 +183,7 @@ def _wait_for(entry: Entry) -> JobOutcome:
     return queue.last
 
 
-class Session:
+class StepRunner:
     """Runs the steps of one piece of work at a time, beside the queue. All methods are for Blender's main thread."""
 
     def __init__(self, busy: str, cancelled: str) -> None:

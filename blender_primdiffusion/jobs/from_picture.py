@@ -48,13 +48,13 @@ class PictureTask:
 
     pictures: tuple[str, ...]
     mask: str
-    """Of a single picture, of several without effect; empty where it has alpha."""
+    """Path of the mask of a single picture; empty if it has alpha. Ignored for several pictures."""
     camera: int
     """Session uid."""
     cameras: Mapping[str, Any]
     """That of the first picture, as in cameras.json."""
     size: tuple[int, int]
-    """Of the first picture."""
+    """Width and height of the first picture, pixels."""
     posed: Mapping[str, Any] | None = None
     """Poses, translations and betas of the human posed over the pictures; None to start from a standing one."""
 

@@ -72,7 +72,7 @@ def frame_in_view() -> None:
 
 
 _STEP_PICTURE_PX = 256
-"""Of the picture after each step, for the panel."""
+"""Width and height of the panel's picture after each step, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,7 +25,7 @@ from ..files.regular_files import is_local_path, remove_folder
 from ..places import EXTENSION, new_backend, preference
 
 PREVIEW_PX = 16
-"""Of the child's previews, which most jobs do not use."""
+"""Size of the child's previews, pixels; most jobs do not use them."""
 
 
 class Job(abc.ABC):
@@ -80,7 +80,7 @@ def chosen_checkpoint() -> str:
 
 
 _LOG_LINES = 40
-"""Of the child, in the file for a bug report."""
+"""Lines of the child's output in the file for a bug report."""
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
 

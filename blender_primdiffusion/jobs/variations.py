@@ -84,7 +84,7 @@ class Sheet:
 
 
 sheet, backs = Sheet(), Sheet()
-"""Those of Variations, and of the last human from a picture; for all windows and scenes."""
+"""Sheets of Variations and of the last human from a picture; for all windows and scenes."""
 
 PICTURE_PX = 256
 

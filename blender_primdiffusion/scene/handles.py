@@ -18,13 +18,13 @@ from .actions import action_curves, frames_in_use, own_curves, posed_on
 from .armature import CONTROLS, LIMBS, POLE_M, Limb, editing_bones, place_controls, rest_rotations
 
 COLLECTION = "IK Handles"
-"""Of bones: handles and poles."""
+"""Bone collection of handles and poles."""
 _MOVED = tuple(joint for limb in LIMBS for joint in limb.joints)
 _TURN = "rotation_quaternion"
 _JOINT_KEYS = dict.fromkeys(_MOVED, (_TURN,))
 _CONTROL_KEYS = {limb.handle: ("location", _TURN) for limb in LIMBS} | {limb.pole: ("location",) for limb in LIMBS}
 _STIFFNESS = 0.9
-"""Of elbows and knees against twisting and bending sideways, which Blender's solver would do as readily."""
+"""Stiffness of elbows and knees against twisting and bending sideways, which Blender's solver does not avoid."""
 _COLOUR = "THEME09"
 _BOX_M = {"handle": 0.02, "pole": 0.015}
 

@@ -25,7 +25,7 @@ MARK = "primdiffusion_merged"
 """Custom property of a merged object: its `MergedState` as JSON."""
 _SHAPES = {"density": ("X", "Y", "Z"), "colour": ("X", "Y", "Z", 3), "origin": (3,), "voxel": ()}
 _DECIMALS = 4
-"""Of matrices in digests: a tenth of a millimetre."""
+"""Decimals of matrices in digests: a tenth of a millimetre."""
 
 
 @dataclasses.dataclass(frozen=True)

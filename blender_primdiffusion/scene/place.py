@@ -92,5 +92,5 @@ def _solids(depsgraph: bpy.types.Depsgraph, extent: NDArray) -> Iterator[NDArray
 
 
 def is_solid(obj: bpy.types.Object) -> bool:
-    """Whether an object has a surface and is no part of a human."""
+    """Whether an object has a surface and is not part of a human."""
     return obj.type in _SOLID_TYPES and not any(mark in obj for mark in _OF_HUMANS)

@@ -23,7 +23,7 @@ SHARE = 0.5
 SAME_BETAS = 1e-5
 """Betas that differ by less are the same shape."""
 DENSITY = 985.0
-"""Of a living body with air in the lungs, kg/m^3."""
+"""Density of a living body with air in the lungs, kg/m^3."""
 MOST_CORRECTIONS = 20
 _TOLERANCE = np.array([1e-4, 1e-2])
 """Metres, kilograms."""
@@ -268,7 +268,7 @@ def _unit(vectors: NDArray) -> NDArray[np.float64]:
 
 
 def betas_of(person: bpy.types.Object) -> NDArray[np.float64]:
-    """The human's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
+    """The human's shape [10] as the engine draws it now. Raises ValueError where it is not a list of ten numbers."""
     if BETAS not in person:
         return generated_betas(person)
     betas = stored_numbers(person, BETAS, BETA_COUNT)

@@ -26,7 +26,7 @@ from ..formats.answers import CapturesProgress
 from ..formats.camera_rig import Rig
 from ..formats.requests import PASSES
 from ..formats.schema import read
-from ..jobs.follow import Reporting, Session
+from ..jobs.follow import Reporting, StepRunner
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
 from .declared import declared
@@ -139,7 +139,7 @@ def _camera_args(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, f
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_captures", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_captures)),)
 
 
-captures = Session("captures are being rendered", "Cancelled; the same settings resume from here")
+captures = StepRunner("captures are being rendered", "Cancelled; the same settings resume from here")
 """One for all windows."""
 
 

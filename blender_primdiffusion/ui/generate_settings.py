@@ -30,7 +30,7 @@ _LONGEST_TEXT = 1 << 16
 _LARGEST_NUMBER = 1e9
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
-"""Those with a menu."""
+"""Attributes with a menu."""
 SCALARS = {"height": "m", "weight": "kg"}
 _DEFAULT_CHECKPOINT = Path("primdiffusion", "weights", "default.safetensors")
 
@@ -56,7 +56,7 @@ class Vocabulary:
 def read_vocabulary(path: Path) -> Vocabulary:
     """The vocabulary of a checkpoint; an empty one where the file has none.
 
-    Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
+    Raises OSError for a file that cannot be read and ValueError for one that is not a checkpoint.
     """
     with as_file_error(path, "is damaged or no checkpoint of a diffusion model", "choose another file"):
         with open_regular(path, _LARGEST_FILE) as file:

@@ -15,7 +15,7 @@ from ..backend.environment import state_of
 from ..backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
 from ..backend.requests import Steps, sentence
 from ..engine import drawing_child
-from ..jobs.follow import Reporting, Session
+from ..jobs.follow import Reporting, StepRunner
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, cache_folder, set_up_folder
 from .declared import SKIP
@@ -25,7 +25,7 @@ LOCKS = Path(__file__).resolve().parents[1] / "requirements"
 _ONLINE = "Blender may not use the network: allow it, or name an existing Python in the preferences."
 
 
-session = Session(
+session = StepRunner(
     "the backend is being set up already", "Cancelled; what has been downloaded is used by the next Set Up Backend"
 )
 """One for all windows."""

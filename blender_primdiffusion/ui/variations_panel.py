@@ -142,7 +142,7 @@ MOST_COLUMNS = 8
 _MARGIN_PX = 40
 """Borders and scroll bar of the sidebar."""
 _UNIT_PX = 20
-"""Of Blender's interface at a scale of 1: what `template_icon` counts in."""
+"""Pixels of a unit of Blender's interface at a scale of 1, in which `template_icon` counts."""
 
 
 def draw_variations(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -1,22 +1,14 @@
-"""The comparison of Table 2: the latent baseline, training by processor time, and the table's figures."""
+"""The comparison of Table 2: bodies that stand together, rays and keypoints."""
 
 import argparse
-import dataclasses
 import importlib.util
 
 import everywhere
 import numpy as np
 import pytest
-from diffusion_people import small_model
 from primdiffusion.capture.coco import KEYPOINTS
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
-
-
-@pytest.fixture(scope="module")
-def baseline():
-    model = small_model()
-    return dataclasses.replace(model, card={**model.card, "baseline": "latents"})
 
 
 def front() -> View:

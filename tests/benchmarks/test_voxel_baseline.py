@@ -3,19 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
-from support.priors import of_whole_body
 from voxel_baseline import (
     SIDE,
     VoxelCodec,
-    VoxelModel,
-    VoxelUNetConfig,
     fit_voxel_codec,
     primitives_of,
-    voxel_denoiser,
     voxelise_payload,
 )
 
@@ -74,23 +69,3 @@ def test_codec_gives_back_what_lies_in_its_basis(codec):
     assert float((decoded[..., :3] - wanted)[solid].abs().mean()) < 0.02
     assert float((decoded[..., 3] * solid).sum() / solid.sum()) > 0.2
     assert torch.allclose(codec.basis @ codec.basis.T, torch.eye(16), atol=1e-5)
-
-
-@pytest.fixture(scope="module")
-def model(codec) -> VoxelModel:
-    shape = (16, len(codec.cells), 1)
-    size, generator = shape[0] * shape[1], torch.Generator().manual_seed(0)
-    prior = of_whole_body(
-        mean=torch.zeros(shape),
-        basis=torch.linalg.qr(torch.randn(size, 3, generator=generator))[0].T.contiguous(),
-        parity=torch.ones(3),
-        rest_variance=torch.full(shape, 0.01),
-        log_weight=torch.zeros(1, 1),
-        centre=torch.zeros(1, 1, 3),
-        axes=torch.eye(3)[None],
-        variance=torch.ones(1, 3),
-        kind=torch.zeros(1, 1, 0),
-    )
-    denoiser = voxel_denoiser(prior, codec, VoxelUNetConfig())
-    shapes = ShapePrior(torch.ones(10, 2), torch.zeros(10), torch.eye(10), torch.full((10,), 3.0))
-    return VoxelModel(denoiser, codec, shapes, FULL, {"steps": {"local": 1}})

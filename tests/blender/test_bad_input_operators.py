@@ -205,12 +205,12 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """Nothing is downloaded or installed."""
-    from blender_primdiffusion.jobs.follow import Session
+    from blender_primdiffusion.jobs.follow import StepRunner
 
-    def start(session: Session, _steps: object) -> None:
+    def start(session: StepRunner, _steps: object) -> None:
         session.notice = "as if it were done"
 
-    monkeypatch.setattr(Session, "start", start)
+    monkeypatch.setattr(StepRunner, "start", start)
     monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: anna / "set up")
     bpy.context.preferences.system.use_online_access = True
     yield

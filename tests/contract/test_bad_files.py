@@ -44,7 +44,7 @@ from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.people.stored_people import read_payloads
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from support.tiny import save_tiny_checkpoint, tiny_model
 
 LONGEST_SENTENCE, LONGEST_S, MOST_MEMORY = 300, 5.0, 500 * 2**20
@@ -329,7 +329,7 @@ def within_limits(folder: Path) -> Iterator[None]:
 
 
 def assert_one_sentence(error: Exception, name: str) -> None:
-    found = describe(error)
+    found = to_user_error(error)
     assert found is not None, f"a traceback: {error!r}"
     assert name in found.sentence
     assert "\n" not in found.sentence

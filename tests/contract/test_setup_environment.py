@@ -200,17 +200,9 @@ def test_a_python_that_cannot_make_an_environment_is_named(place, tmp_path, monk
 
 
 ROOT = Path(__file__).parents[2]
-
-
 LOCKS = ROOT / "blender_primdiffusion" / "requirements"
-
-
 LINUX = Machine("linux_x86_64", (3, 11), None, False, None)
-
-
 CARD = Machine("linux_x86_64", (3, 11), None, True, 580)
-
-
 BOTH = ("cpu", "cuda")
 
 
@@ -264,8 +256,6 @@ def test_the_environment_goes_to_a_short_folder_only_where_windows_needs_it():
 
 BLENDERS = ((3, 11), (3, 13))
 """Pythons of Blender's own builds: 5.0, 5.1 and newer."""
-
-
 OF_DISTRIBUTIONS = (3, 14)
 
 

@@ -1,15 +1,15 @@
 """Runs of commands: their processes, and what training leaves in a folder."""
 
+import itertools
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import pytest
 import torch
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from safetensors.torch import load_file
 
 _TESTS = Path(__file__).parents[1]
@@ -31,7 +31,7 @@ def child_environment() -> dict[str, str]:
 
 def sentence(error: BaseException) -> str:
     """What the command line would print of an error; a defect has none."""
-    failure = describe(error)
+    failure = to_user_error(error)
     assert failure is not None
     assert "\n" not in str(failure)
     return str(failure)
@@ -41,23 +41,27 @@ class Ended(Exception):
     """By its owner."""
 
 
-def ended_at_each_report(work: Callable[[Callable[..., None]], object], out: Path) -> None:
-    """Do work that writes a folder, and again, ended at each of its reports in turn: then there is no folder."""
-    reports = []
-    work(lambda *report, **_: reports.append(report))
-    shutil.rmtree(out)
-    assert len(reports) > 1
-    for end in range(len(reports)):
-        left = [None] * end
+def ended_at_each_report(work: Callable[[Callable[..., None]], Any], out: Path) -> tuple[Any, list[tuple]]:
+    """Do work that writes a folder, ended at each of its reports in turn, which leaves no folder, then to its end.
 
-        def report(*_: object, left=left, **__: object) -> None:
-            if not left:
+    Returns the answer of the last and its reports.
+    """
+    for end in itertools.count():
+        reports = []
+
+        def report(*about: object, end=end, reports=reports, **_: object) -> None:
+            if len(reports) == end:
                 raise Ended
-            left.pop()
+            reports.append(about)
 
-        with pytest.raises(Ended):
-            work(report)
-        assert not out.exists()
+        try:
+            answer = work(report)
+        except Ended:
+            assert not out.exists()
+        else:
+            assert len(reports) == end > 1
+            return answer, reports
+    raise AssertionError
 
 
 def rows(run: Path) -> list[dict]:

@@ -57,7 +57,7 @@ def load_body(
     pose_basis = arrays.real("posedirs", (vertex_count, 3, POSE_FEATURES))
     skin_weights = arrays.real("weights", (vertex_count, J))
     if skin_weights.min() < -1e-4 or np.abs(skin_weights.sum(1) - 1).max() > 1e-2:
-        raise arrays.wrong("weights", "has rows that are no weights (non-negative, with sum 1)")
+        raise arrays.wrong("weights", "has rows that are not weights (non-negative, with sum 1)")
     regressor = arrays.real("J_regressor", (J, vertex_count))
     coordinates, coordinate_faces = _texture_coordinates(uv, faces)
     return BodyModel(

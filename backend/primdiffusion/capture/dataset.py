@@ -199,7 +199,7 @@ def batches(
 
 
 def stack(records: Sequence[Record]) -> Record:
-    """Stack records of one type along a new first dimension; fields that are no tensors come from the first."""
+    """Stack records of one type along a new first dimension; fields that are not tensors come from the first."""
     first = records[0]
     stacked = {}
     for field in dataclasses.fields(first):

@@ -32,7 +32,7 @@ from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.rasterise import Draw
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.runtime.device import fixed_threads
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from primdiffusion.runtime.worker_process import each
 
 JPEG_QUALITY = 95
@@ -282,7 +282,7 @@ def _render_subject(job: RenderJob, name: str) -> SubjectResult:
         capture_layout.complete(job.out / name)
         return SubjectResult(name, "done", views=views)
     except Exception as e:
-        failure = describe(e)
+        failure = to_user_error(e)
         if failure is None:
             raise
         return SubjectResult(name, "failed", str(failure))

@@ -153,7 +153,7 @@ class ExportCaptures:
     root: tyro.conf.Positional[Path]
     """Folder of a capture dataset, of this program or in the released layout; the files go there."""
     projects: tuple[Project, ...] = ("nerf", "opencv", "colmap")
-    """Whose files to write."""
+    """Programs to write files for."""
 
     def run(self) -> None:
         """Write, and print a line for each subject."""

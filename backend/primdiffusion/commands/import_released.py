@@ -30,7 +30,7 @@ from primdiffusion.released.stage_one import PREFIX as STAGE_ONE
 from primdiffusion.released.stage_one import encoder_tensors
 
 SMPL_CELLS_OUTSIDE = 214
-"""Of 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""
+"""Number of the 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""
 SAME_BODY = 1e-4
 """Largest difference between two files of one body, metres."""
 

@@ -70,7 +70,7 @@ def edit_generator(seed: int) -> torch.Generator:
 def kept_attributes(
     model: DiffusionModel, human: Human, x0: Float[Tensor, "1 c h w"], asked: Mapping[str, str | float]
 ) -> Mapping[str, str | float]:
-    """What an edit is conditioned on: what was asked for, and plain clothes of pictures that the prior mistakes."""
+    """Condition of an edit: the attributes asked for, and plain clothes where the prior misreads pictures."""
     from_pictures = "reconstructed_from" in human.provenance
     plain = from_pictures and "pattern" not in asked and model.plain_after_all(x0)
     return {**asked, "pattern": "plain"} if plain else asked

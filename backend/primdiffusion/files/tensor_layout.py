@@ -31,7 +31,7 @@ DTYPES = {
 
 @dataclasses.dataclass(frozen=True)
 class StoredTensor:
-    """What a header says of a tensor."""
+    """A tensor's entry in the header."""
 
     dtype: str
     """The format's name of the type, such as "F32"."""

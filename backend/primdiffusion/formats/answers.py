@@ -61,7 +61,7 @@ class ReconstructAnswer(HumanAnswer):
     posture: Path | None = None
     """posture.json: pose, shape and cameras in pictures; None for captures."""
     fit: Percent | None = None
-    """How well the body in that posture explains the pictures; None for captures."""
+    """Quality of the fit, percent: how well the body in that posture explains the pictures. None for captures."""
     backs: list[VariationFiles] = dataclasses.field(default_factory=list)
     """Further humans of the same pictures, seen from behind."""
 
@@ -84,7 +84,7 @@ class FitPostureAnswer(Open):
     warnings: list[str]
     """Sentences."""
     fit: Percent | None = None
-    """How well the body in that posture explains the pictures."""
+    """Quality of the fit, percent: how well the body in that posture explains the pictures."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -59,7 +59,7 @@ def version_fault(metadata: Mapping[str, str]) -> tuple[str, str] | None:
 
 
 def provenance_of(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """How the human was made. Raises ValueError for what is no JSON object or has entries of a wrong type."""
+    """Origin of the human. Raises ValueError for what is not a JSON object or has entries of a wrong type."""
     try:
         provenance = parse_json(metadata.get("provenance", ""))
     except ValueError as error:

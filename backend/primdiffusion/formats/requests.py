@@ -18,7 +18,7 @@ Transfer = Literal["texture", "garment"]
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 InpaintMethod = Literal["repaint", "released"]
 Compositing = Literal["linear", "released"]
-"""How pictures are drawn: as in Blender, or as the authors' code draws them."""
+"""Appearance of pictures: as in Blender, or as the authors' code draws them."""
 View = Literal["colour", "depth", "alpha", "boxes"]
 VIEWS: tuple[View, ...] = get_args(View)
 WHOLE_PARTS = (
@@ -33,7 +33,7 @@ SIDED_PARTS = (
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
 """Body parts that regions consist of."""
 Reconstruction = Literal["encoder", "prior"]
-"""How views become a human."""
+"""Method that turns views into a human."""
 PASSES = ("img", "mask", "depth", "normal", "part")
 """Images of a captured view."""
 FLOAT_DEPTH = "depth_float"
@@ -48,7 +48,7 @@ voxels (2 to 14 mm) at eight times the memory."""
 LARGEST_SEED = 2**63 - 1
 
 Seed = Annotated[int, Range(0, LARGEST_SEED)]
-Share = Annotated[float, Range(0, 1)]
+Fraction = Annotated[float, Range(0, 1)]
 Pixels = Annotated[int, Range(1, 65_536)]
 StepPixels = Annotated[int, Range(0, 1024), Option(hidden=True)]
 """Larger previews would delay sampling and cancelling."""
@@ -151,8 +151,8 @@ class VariationsRequest(Sampling, Conditioning):
     """Width and height of the previews, pixels."""
     person: Path | None = None
     """A .human.safetensors file: generate variants of this human, as `vary` does, instead of new humans."""
-    amount: Share = 0.5
-    """How much variants differ from this human: 0 not at all, 1 almost completely."""
+    amount: Fraction = 0.5
+    """Difference of the variants from this human: 0 none, 1 almost complete."""
 
     def check(self) -> None:
         """Raise FieldError for a seed that is given twice."""
@@ -180,8 +180,8 @@ class EditRequest(StepPreviews):
 class VaryRequest(EditRequest, Conditioning):
     """Generate a variant of a human: the same body with other clothes and another face."""
 
-    amount: Share = 0.5
-    """How much the new human may differ from this one: 0 not at all, 1 almost completely."""
+    amount: Fraction = 0.5
+    """Difference of the new human from this one: 0 none, 1 almost complete."""
     seed: Seed = 0
     """Another seed gives another result; the same seed gives the same result."""
 
@@ -192,8 +192,8 @@ class InterpolateRequest(EditRequest):
 
     other: Person
     """A second .human.safetensors file."""
-    fraction: Share = 0.5
-    """Share of the other human: 0 is exactly this human, 1 exactly the other."""
+    fraction: Fraction = 0.5
+    """Fraction of the other human: 0 is exactly this human, 1 exactly the other."""
 
     def check(self) -> None:
         """Raise FieldError for a single step."""
@@ -235,7 +235,7 @@ class TransferRequest(RegionRequest):
     """A .human.safetensors file to copy from."""
     what: Transfer = "texture"
     """texture: colours only, for garments of the same cut; garment: shape too."""
-    harmonise: Share = 0.0
+    harmonise: Fraction = 0.0
     """How much the region is denoised again to match the rest of the human: 0 copies it exactly."""
 
 
@@ -490,7 +490,7 @@ class GaussiansRequest:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EncodeSettings(Checked):
-    """How captures become payloads, by the encoder."""
+    """Settings of the encoder that turns captures into payloads."""
 
     views: Count = 8
     """Images to encode, spread around the subject; all if there are fewer."""

@@ -140,7 +140,7 @@ class Slider:
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """How a field is given on a command line, where not as an option of its own name."""
+    """Form of a field on the command line, if it is not an option of its own name."""
 
     name: str = ""
     positional: bool = False

@@ -59,12 +59,12 @@ def optional_package(module: str, extra: str = "", missing: str = "") -> ModuleT
 _LONGEST_NAME, _LONGEST_VALUE = 200, 80
 """Characters of a path, and of a quoted text or list, in a sentence."""
 _VALUE = re.compile(r"(?<!\w)'[^'/\\]*'|\[[^\[\]/\\]*\]")
-"""A quoted text or a list that is no path."""
+"""A quoted text or a list that is not a path."""
 PICTURE_REMEDY = "choose a smaller resolution, or close other programs, then try again"
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
 
 
-def describe(error: BaseException) -> ErrorDescription | None:
+def to_user_error(error: BaseException) -> ErrorDescription | None:
     """Return the description of a domain error, or None for a bug. It holds no terminal escapes of a file."""
     found = _described(error)
     return None if found is None else dataclasses.replace(found, sentence=printable(found.sentence))

@@ -29,7 +29,7 @@ from primdiffusion.people.payloads import store_payloads, voxels_from_payload
 from primdiffusion.people.stored_people import read_payloads
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import DescentSettings
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from primdiffusion.training.refine import refine
 
 
@@ -63,7 +63,7 @@ def encode_people(
         try:
             payloads, betas = looks_of(model, captures, name, settings)
         except Exception as error:
-            failure = describe(error)
+            failure = to_user_error(error)
             if failure is None:
                 raise
             yield SubjectResult(name, "failed", str(failure))

@@ -27,7 +27,7 @@ from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
-from primdiffusion.training.loop import Step
+from primdiffusion.training.loop import TrainingStep
 from primdiffusion.training.losses import RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.surfaces import fit_surfaces
@@ -101,7 +101,7 @@ def load_base(path: Path) -> DiffusionModel:
     """Load a checkpoint to go on from. Raises ValueError unless it is of the default preset; FileNotFoundError."""
     model = load_checkpoint(path)
     if not isinstance(model.denoiser, PersonDenoiser) or model.denoiser.local is None:
-        raise ValueError(f"{path} is no checkpoint of the default preset: give another --start-from")
+        raise ValueError(f"{path} is not a checkpoint of the default preset: give another --start-from")
     return model
 
 
@@ -149,13 +149,13 @@ class CellTask(DiffusionTask):
         assert self.denoiser.local is not None
         return self.denoiser.local
 
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Install a network, in the precision of its settings."""
         self.denoiser.local = network
         fast = self.settings.bfloat16 and has_fast_bfloat16(self.device)
         self.denoiser.network_dtype = torch.bfloat16 if fast else torch.float32
 
-    def loss(self, step: Step) -> Mapping[str, Tensor]:
+    def loss(self, step: TrainingStep) -> Mapping[str, Tensor]:
         """Weighted x0 error of a random batch at random levels."""
         return {"loss": self.objective.loss(step.generator)}
 

@@ -13,7 +13,7 @@ from primdiffusion.diffusion.denoiser import LocalUNetConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
-from primdiffusion.formats.requests import Count, NotNegative, Positive, Share
+from primdiffusion.formats.requests import Count, Fraction, NotNegative, Positive
 from primdiffusion.formats.schema import Checked, Range
 
 Tracker = Literal["tensorboard", "wandb"]
@@ -93,9 +93,9 @@ class NetworkTraining(OptimiserSettings):
     levels: Levels = "uniform"
     """Distribution of noise levels: uniform in t, as in the paper; log_normal in noise over signal, near the spread of
     what is denoised (Karras et al. 2022), with a fifth of all levels evenly in its logarithm."""
-    blend: Share = 0.3
+    blend: Fraction = 0.3
     """Fraction of samples that blend the colour variants of one geometry. Default preset only."""
-    unasked: Share = 0.5
+    unasked: Fraction = 0.5
     """Fraction of samples trained without attributes; the others have a random subset. Default preset only."""
     bfloat16: bool = False
     """Run the network in bfloat16 where the device multiplies it faster than float32."""

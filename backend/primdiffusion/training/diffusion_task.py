@@ -27,7 +27,7 @@ from primdiffusion.primitives.primitives import pack
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.runtime.device import has_bfloat16, has_fast_bfloat16
 from primdiffusion.training.config import NetworkTraining, TrainingConfig
-from primdiffusion.training.loop import Step, Task
+from primdiffusion.training.loop import Task, TrainingStep
 from primdiffusion.training.losses import random_steps, x0_errors
 from primdiffusion.training.muon import MuonAdamW
 from primdiffusion.training.state import TrainingState
@@ -124,7 +124,7 @@ class SlabTask(DiffusionTask):
         """Return the U-Net."""
         return self.denoiser
 
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Use a network as the denoiser."""
         self.denoiser = network
 
@@ -137,7 +137,7 @@ class SlabTask(DiffusionTask):
         payload = payload_of_bytes(torch.stack(voxels).to(self.device), torch.stack(scales).to(self.device), density)
         return pack(payload, density)
 
-    def loss(self, step: Step) -> Mapping[str, Tensor]:
+    def loss(self, step: TrainingStep) -> Mapping[str, Tensor]:
         """x0 error of a random batch at random levels (paper eq. 9)."""
         generator = step.generator
         chosen = torch.randint(

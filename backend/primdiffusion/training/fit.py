@@ -29,7 +29,7 @@ from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
-from primdiffusion.training.loop import Step, Task, train
+from primdiffusion.training.loop import Task, TrainingStep, train
 from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.state import TrainingState, adamw
 from primdiffusion.version import __version__
@@ -110,7 +110,7 @@ class EncoderTask(Task):
         torch.manual_seed(self.config.seed)
         return Encoder(self.config.architecture)
 
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Use an encoder."""
         self.encoder = network
 
@@ -121,7 +121,7 @@ class EncoderTask(Task):
         others = [parameter for parameter in network.parameters() if id(parameter) not in known]
         return adamw(self.config, others, (biases, self.config.place_rate))
 
-    def loss(self, step: Step) -> Mapping[str, Tensor]:
+    def loss(self, step: TrainingStep) -> Mapping[str, Tensor]:
         """Return the weighted terms for the next batch."""
         if self._batches is None:
             start = Position(*parse_json(step.place.get("position", "[0, 0]")))

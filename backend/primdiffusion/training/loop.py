@@ -45,7 +45,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
+class TrainingStep:
     """One optimiser step, as its loss sees it."""
 
     number: int
@@ -85,7 +85,7 @@ class Task(ABC):
         """Return the network as initialised."""
 
     @abstractmethod
-    def put(self, network: nn.Module) -> None:
+    def use_network(self, network: nn.Module) -> None:
         """Use this network from now on: the one in training, or its average."""
 
     def optimiser(self, network: nn.Module) -> torch.optim.Optimizer:
@@ -93,7 +93,7 @@ class Task(ABC):
         return adamw(self.settings, network.parameters())
 
     @abstractmethod
-    def loss(self, step: Step) -> Mapping[str, Tensor]:
+    def loss(self, step: TrainingStep) -> Mapping[str, Tensor]:
         """Return the weighted terms of the objective on a random batch."""
 
     @abstractmethod
@@ -147,7 +147,7 @@ def _train(
         if recorder is not None and state.step > saved:
             _save(task, state, path)
     accelerator.wait_for_everyone()
-    task.put(state.average)
+    task.use_network(state.average)
     return state
 
 
@@ -156,7 +156,7 @@ def begin_training(task: Task, accelerator: Accelerator) -> TrainingState:
     with _memory_named(task):
         network = task.network().requires_grad_(True).to(accelerator.device)
         state = TrainingState(network, task.settings, accelerator, task.optimiser(network))
-    task.put(state.prepared)
+    task.use_network(state.prepared)
     return state
 
 
@@ -171,7 +171,7 @@ def take_step(task: Task, seed: int, state: TrainingState) -> StepMetrics:
     generator, began = torch.Generator(device).manual_seed(seed), time.perf_counter()
     state.prepared.train()
     with _memory_named(task):
-        terms = task.loss(Step(state.step, generator, state.place))
+        terms = task.loss(TrainingStep(state.step, generator, state.place))
         values = {name: float(term.detach()) for name, term in terms.items()}
         if bad := [name for name, value in values.items() if not math.isfinite(value)]:
             raise ValueError(
@@ -250,11 +250,11 @@ class Recorder:
 
     @contextlib.contextmanager
     def _averaged(self) -> Iterator[None]:
-        self.task.put(self.state.average)
+        self.task.use_network(self.state.average)
         try:
             yield
         finally:
-            self.task.put(self.state.prepared)
+            self.task.use_network(self.state.prepared)
 
     def _write(self, values: Mapping[str, float]) -> None:
         step, steps = self.state.step, self.task.settings.steps

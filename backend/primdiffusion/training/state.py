@@ -21,7 +21,7 @@ from primdiffusion.training.config import OptimiserSettings
 from primdiffusion.training.muon import BETAS, MuonAdamW
 
 PATIENCE = datetime.timedelta(hours=3)
-"""How long processes wait for the main process, which alone evaluates, renders and prepares data."""
+"""Longest wait for the main process, which alone evaluates, renders and prepares data."""
 
 
 class TrainingState:

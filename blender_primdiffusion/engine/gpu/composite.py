@@ -18,7 +18,7 @@ Part = tuple[float, float, float, float]
 """Left, bottom, right and top of a part of the region, as fractions of it."""
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
 _CORNERS = 10
-"""Of the polygon for a joint."""
+"""Corners of the polygon drawn for a joint."""
 
 _VERTEX = """
 void main()

@@ -32,9 +32,9 @@ STRIDES = [1, 2, 4]
 SAMPLES_PER_VOXEL = 2.0
 """As the backend's `MarchSettings`."""
 MOST_DOUBLINGS = 16
-"""Of strides, for large humans beside small ones; as the backend's."""
+"""Largest number of doublings of a stride, for large humans beside small ones; as in the backend."""
 MOST_ENTRIES = 2**22
-"""Of all tiles' lists; with more, boxes are listed for larger tiles."""
+"""Largest number of entries in all tiles' lists; with more, boxes are listed for larger tiles."""
 _SHADERS = {
     "list": shaders.list_shader,
     "march": shaders.march_shader,

@@ -23,7 +23,7 @@ from .march import GpuPayload
 from .shaders import cache_until_exit
 
 PAYLOADS_KEPT = 4
-"""Of humans that are no longer drawn; 4 MB each."""
+"""Payloads kept of humans that are no longer drawn; 4 MB each."""
 READING_S = 0.1
 """Time for reading the files of new humans in one go."""
 _UNRELATED = (

@@ -25,7 +25,7 @@ WIDER = 8
 CHUNK = 16
 """Lattice points, of the finest in a tile, that are composited together."""
 MOST_CHUNKS = 2**16
-"""Of a ray."""
+"""Largest number of chunks of a ray."""
 
 _RECORDS = f"""
 vec4 record(int box, int texel)

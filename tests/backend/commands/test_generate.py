@@ -25,6 +25,7 @@ from primdiffusion.human import generate as generate_human
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.render.march import RELEASED
 from primdiffusion.render.reference import march_reference
+from support.errors import refused
 from support.runs import ended_at_each_report
 from support.tiny import model_of_two_kinds, save_tiny_checkpoint, save_tiny_encoder
 
@@ -65,17 +66,15 @@ def test_a_model_stays_loaded_until_another_is_asked_for(tmp_path, monkeypatch, 
 
 def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
     request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=32)
-    stages = []
-    generate(request, Session(), lambda *report: stages.append(report[0]))
-    assert stages == ["load", "sample", "sample", "sample", "write", "write"]
-    ended_at_each_report(lambda report: generate(request, Session(), report), tmp_path / "out")
+    _, reports = ended_at_each_report(lambda report: generate(request, Session(), report), tmp_path / "out")
+    assert [report[0] for report in reports] == ["load", "sample", "sample", "sample", "write", "write"]
 
 
 def test_nothing_is_written_through_a_link_in_the_folder_of_several_humans(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out" / "seed_000003").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(ValueError, match="seed_000003 is a link"):
+    with refused(ValueError, "seed_000003"):
         cli.run(["generate", "--seed", "3", "--count", "2", "--out", str(tmp_path / "out")])
     assert not list((tmp_path / "elsewhere").iterdir())
 
@@ -132,7 +131,7 @@ def test_released_compositing_changes_no_other_sampler(checkpoint, tmp_path):
 
 
 def test_only_ddim_ends_above_the_clean_sample(checkpoint):
-    with pytest.raises(ValueError, match="dpmpp_2m ends at the clean sample"):
+    with refused(ValueError, "dpmpp_2m"):
         generate_human(load_checkpoint(checkpoint), 1, 2, "dpmpp_2m", end=RELEASED_END)
 
 

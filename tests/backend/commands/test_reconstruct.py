@@ -21,12 +21,20 @@ from primdiffusion.formats.requests import ReconstructRequest
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
+from primdiffusion.reconstruction import from_captures
 from primdiffusion.reconstruction.from_captures import reconstruct
 from support.runs import ended_at_each_report
 from support.tiny import TINY, save_tiny_checkpoint, save_tiny_encoder, tiny_encoder
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 FIRST, SECOND = "person_000000", "person_000001"
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """A few steps of descent."""
+    for name in ("DESCENT", "PULLED_DESCENT"):
+        monkeypatch.setattr(from_captures, name, dataclasses.replace(getattr(from_captures, name), steps=4))
 
 
 @pytest.fixture(scope="module")
@@ -145,14 +153,15 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
     assert torch.allclose(reconstruct(tiny_encoder(), person).payload.rgb, whole.payload.rgb, atol=1e-4)
 
 
-def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
+def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint):
     folder = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
     request = ReconstructRequest(capture=folder, out_dir=tmp_path / "out", checkpoint=checkpoint, size=32)
-    session, reports = Session(), []
-    result = commands.reconstruct(request, session, lambda *report: reports.append(report))
+    session = Session()
+    result, reports = ended_at_each_report(
+        lambda report: commands.reconstruct(request, session, report), tmp_path / "out"
+    )
     stages = [("load", 0), ("read", 1), ("encode", 2), ("write", 3), ("write", 4)]
     assert [report[:2] for report in reports] == stages
     assert result.subject == FIRST
     assert result.views == [0, 1, 2, 3]
     assert "is inside the masks" in result.warnings[0]
-    ended_at_each_report(lambda report: commands.reconstruct(request, session, report), tmp_path / "out")

@@ -1,7 +1,9 @@
 """Humans from plain pictures: the command line and the child's requests, without the child."""
 
+import contextlib
+import dataclasses
+import io
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human
-from primdiffusion.reconstruction import from_pictures
+from primdiffusion.reconstruction import from_captures, from_pictures
 from primdiffusion.reconstruction.posture_start import standing
 from primdiffusion.render.march import march
 from support.runs import ended_at_each_report
@@ -26,11 +28,14 @@ FILES = ["depth.png", "front.png", "person.human.safetensors", "posture.json", "
 COLOURS = torch.tensor([30.0, -20.0, 5.0])
 
 
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def short():
     """Few steps in small pictures."""
     rounds = [from_pictures.Round(48, from_pictures.Stage(4, 0.03), steps) for steps in (1, 0)]
-    monkeypatch.setattr(from_pictures, "ROUNDS", rounds)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(from_pictures, "ROUNDS", rounds)
+        patch.setattr(from_captures, "PULLED_DESCENT", dataclasses.replace(from_captures.PULLED_DESCENT, steps=4))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -48,15 +53,26 @@ def picture(tmp_path_factory):
     return path
 
 
+def command(picture, checkpoint, out):
+    return ["reconstruct", str(picture), "--checkpoint", str(checkpoint), "--out", str(out), "--size", "32"]
+
+
 @pytest.fixture
 def line(picture, checkpoint, tmp_path):
-    options = ["--checkpoint", str(checkpoint), "--out", str(tmp_path / "out"), "--size", "32"]
-    return ["reconstruct", str(picture), *options]
+    return command(picture, checkpoint, tmp_path / "out")
 
 
-def test_a_picture_becomes_a_human_and_its_posture(line, tmp_path, capsys):
-    cli.main(line)
-    out = tmp_path / "out"
+@pytest.fixture(scope="module")
+def made(picture, checkpoint, tmp_path_factory):
+    """The folder that `line` writes, and what it prints; not to be changed."""
+    folder, printed, said = tmp_path_factory.mktemp("made") / "out", io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
+        cli.main(command(picture, checkpoint, folder))
+    return folder, printed.getvalue(), said.getvalue()
+
+
+def test_a_picture_becomes_a_human_and_its_posture(made):
+    out, printed, said = made
     assert sorted(path.name for path in out.iterdir()) == FILES
     human = load_human(out / "person.human.safetensors")
     assert human.provenance["reconstructed_from"] == ["anna.png"]
@@ -64,61 +80,48 @@ def test_a_picture_becomes_a_human_and_its_posture(line, tmp_path, capsys):
     assert red > green
     posture = json.loads((out / "posture.json").read_text())
     assert posture["betas"] == pytest.approx(human.betas.tolist(), abs=1e-4)
-    printed = capsys.readouterr()
-    assert "only one picture" in printed.err
-    assert "no pose was given" in printed.err
+    assert "only one picture" in said
+    assert "no pose was given" in said
     percent = posture["fit"]["percent"]
-    assert f", fit {percent} %, " in printed.out
-    assert (f"the fit is {percent} %" in printed.err) == (percent < 85)
+    assert f", fit {percent} %, " in printed
+    assert (f"the fit is {percent} %" in said) == (percent < 85)
 
 
-def test_the_posture_can_be_used_again_without_refining(line, tmp_path):
-    cli.main(line)
-    first = shutil.copytree(tmp_path / "out", tmp_path / "first")
-    cli.main([*line, "--pose", str(first / "posture.json"), "--no-refine"])
-    before, after = (json.loads((folder / "posture.json").read_text()) for folder in (first, tmp_path / "out"))
+def test_the_posture_can_be_used_again_without_refining(made, line, tmp_path):
+    cli.main([*line, "--pose", str(made[0] / "posture.json"), "--no-refine"])
+    before, after = (json.loads((folder / "posture.json").read_text()) for folder in (made[0], tmp_path / "out"))
     for key in ("pose", "translation", "betas"):
         assert np.allclose(before[key], after[key], atol=2e-5)
     assert np.allclose(before["cameras"]["camera0000"]["K"], after["cameras"]["camera0000"]["K"], atol=0.05)
 
 
-def test_a_photograph_without_a_mask_is_cut_out_by_the_body_posed_over_it(line, picture, tmp_path, capsys):
+def test_a_photograph_without_a_mask_is_cut_out_by_the_body_posed_over_it(made, line, picture, tmp_path, capsys):
     pytest.importorskip("cv2")
-    cli.main(line)
-    posture = shutil.copy(tmp_path / "out" / "posture.json", tmp_path / "posture.json")
     cut = Image.open(picture)
     plain = Image.new("RGB", cut.size, (40, 160, 60))
     plain.paste(cut, mask=cut)
     plain.save(tmp_path / "plain.png")
-    cli.main(["reconstruct", str(tmp_path / "plain.png"), *line[2:], "--pose", str(posture)])
+    cli.main(["reconstruct", str(tmp_path / "plain.png"), *line[2:], "--pose", str(made[0] / "posture.json")])
     assert "look at mask.png" in capsys.readouterr().err
     mask, true = np.asarray(Image.open(tmp_path / "out" / "mask.png")) > 127, np.asarray(cut)[..., 3] > 127
     assert mask.shape == true.shape
     assert (mask & true).sum() / (mask | true).sum() > 0.9
 
 
-def test_seeds_vary_the_human_and_repeat(line, tmp_path):
-    payloads = []
-    for seed in ("1", "2", "1"):
-        cli.main([*line, "--seed", seed])
-        human = load_human(tmp_path / "out" / "person.human.safetensors")
-        assert human.provenance["seed"] == int(seed)
-        payloads.append(human.payload.rgb)
-    assert not torch.equal(payloads[0], payloads[1])
-    assert torch.equal(payloads[0], payloads[2])
-
-
-def test_backs_to_choose_from_are_the_humans_of_their_seeds(line, tmp_path):
+def test_backs_to_choose_from_are_the_humans_of_their_seeds(made, line, tmp_path):
     cli.main([*line, "--backs", "2"])
     out, alone = tmp_path / "out", tmp_path / "alone"
     backs = ["0.human.safetensors", "0.png", "1.human.safetensors", "1.png"]
     assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, *backs])
-    for name, more in {"person": [], "0": ["--seed", "0"], "1": ["--seed", "1"]}.items():
-        cli.main([*line, *more, "--out", str(alone)])
-        one, other = (load_human(path / f"{end}.human.safetensors") for path, end in ((out, name), (alone, "person")))
-        assert torch.equal(one.payload.rgb, other.payload.rgb)
-        assert one.provenance == other.provenance
     assert Image.open(out / "1.png").size == (32, 32)
+    cli.main([*line, "--seed", "1", "--out", str(alone)])
+    person, *others = (load_human(out / f"{name}.human.safetensors") for name in ("person", "0", "1"))
+    for one, folder in ((person, made[0]), (others[1], alone)):
+        again = load_human(folder / "person.human.safetensors")
+        assert torch.equal(one.payload.rgb, again.payload.rgb)
+        assert one.provenance == again.provenance
+    assert [human.provenance["seed"] for human in others] == [0, 1]
+    assert not torch.equal(others[0].payload.rgb, others[1].payload.rgb)
 
 
 def test_progress_never_goes_back_and_says_how_long_it_takes(picture, checkpoint, tmp_path, monkeypatch):
@@ -146,13 +149,11 @@ def test_two_pictures_have_a_pose_and_a_camera_each(line, picture, tmp_path):
 
 def test_a_fit_alone_writes_the_posture_and_can_be_cancelled_at_every_report(picture, checkpoint, tmp_path):
     request = FitPostureRequest(pictures=(picture,), out_dir=tmp_path / "out", checkpoint=checkpoint)
-    reports = []
-    answer = fit_posture(request, Session(), lambda *report: reports.append(report[:3]))
+    answer, reports = ended_at_each_report(lambda report: fit_posture(request, Session(), report), tmp_path / "out")
     assert answer.posture == tmp_path / "out" / "posture.json"
     assert answer.fit == json.loads(answer.posture.read_text())["fit"]["percent"]
     assert not any("sides" in warning for warning in answer.warnings)  # a fit makes none
     assert [report[0] for report in reports[:2]] == ["load", "read"]
-    ended_at_each_report(lambda report: fit_posture(request, Session(), report), tmp_path / "out")
 
 
 def test_impossible_requests_are_one_sentence_and_leave_nothing(line, picture, tmp_path, fails):

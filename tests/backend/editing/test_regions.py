@@ -136,14 +136,14 @@ def test_the_threshold_is_the_share_of_a_patch_that_is_painted(rest):
     ("weights", "fact"),
     [
         (torch.ones(100), "12196 vertices"),
-        (torch.ones(12196, 1), r"\(12196, 1\)"),
+        (torch.ones(12196, 1), "(12196, 1)"),
         (torch.zeros(12196), "covers no primitive"),
-        (torch.full((12196,), 0.4), r"at most 0\.40, threshold 0\.5"),
+        (torch.full((12196,), 0.4), "0.40"),
         (torch.full((12196,), float("nan")), "NaN"),
     ],
 )
 def test_unusable_paint_is_rejected(weights, fact):
-    with pytest.raises(ValueError, match=fact):
+    with refused(ValueError, fact):
         region_from_weights(weights)
 
 
@@ -157,12 +157,12 @@ def test_a_threshold_outside_0_to_1_is_rejected(threshold):
     ("region", "fact"),
     [
         (torch.zeros(K, dtype=torch.bool), "empty"),
-        (torch.ones(K - 1, dtype=torch.bool), r"bool \(1023,\)"),
-        (torch.ones(K), r"float32 \(1024,\)"),
+        (torch.ones(K - 1, dtype=torch.bool), "bool (1023,)"),
+        (torch.ones(K), "float32 (1024,)"),
     ],
 )
 def test_an_invalid_mask_is_rejected(region, fact):
-    with pytest.raises(ValueError, match=fact):
+    with refused(ValueError, fact):
         check_region(region)
 
 

@@ -11,6 +11,7 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from primdiffusion.render.march import MarchSettings
+from support.errors import refused
 from support.tiny import tiny_model
 
 
@@ -68,13 +69,13 @@ def test_a_folder_gives_what_was_drawn(image, tmp_path):
     [
         (lambda folder: (folder / "a.png").unlink(), "no pictures"),
         (lambda folder: Image.new("RGB", (8, 9)).save(folder / "a.png"), "8 x 9"),
-        (lambda folder: (folder / "a.png").write_bytes(b"no picture"), r"a\.png"),
+        (lambda folder: (folder / "a.png").write_bytes(b"no picture"), "a.png"),
     ],
 )
 def test_a_folder_that_does_not_fit_is_one_sentence(tmp_path, spoil, words):
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     spoil(tmp_path)
-    with pytest.raises(ValueError, match=words):
+    with refused(ValueError, words):
         list(folder_images(tmp_path))
 
 

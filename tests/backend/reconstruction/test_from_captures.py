@@ -17,9 +17,9 @@ from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
 from primdiffusion.primitives.primitives import Payload, Primitives, S
 from primdiffusion.reconstruction import from_captures
-from primdiffusion.reconstruction.from_captures import HUMAN_STEPS, encode_and_fit, reconstruct, steps_of
+from primdiffusion.reconstruction.from_captures import HUMAN_STEPS, draw_humans, encode_and_fit, reconstruct, steps_of
 from primdiffusion.reconstruction.prior_fit import OBSERVATIONS, PIXEL_STD, PriorFit, targets_of
-from primdiffusion.render.descent import DescentSettings
+from primdiffusion.render.descent import DescentSettings, descend
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
 from scipy.stats import multivariate_normal
@@ -50,6 +50,13 @@ def captured(human: Human, pose: BodyPose, yaws: list[float]) -> CapturedPerson:
     return CapturedPerson("anna", 3, tuple(range(len(yaws))), views, BETAS, ())
 
 
+@pytest.fixture(scope="module")
+def plain() -> tuple[CapturedPerson, Human, int]:
+    """A person in one view, what is made of it, and the number of steps."""
+    person, steps = captured(human_of(COLOURS), BodyPose.rest(), [0.0]), []
+    return person, reconstruct(MODEL, person, on_step=lambda: steps.append(None)), len(steps)
+
+
 @pytest.mark.parametrize("yaws", [[0.0], [0.0, 90.0]], ids=["one view", "two views"])
 def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(yaws):
     human, pose = human_of(COLOURS), BodyPose.from_axis_angle(torch.linspace(-0.2, 0.2, 72))
@@ -62,7 +69,7 @@ def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(y
     assert (found.provenance["reconstructed_from"], found.provenance["views"]) == ("anna", list(range(len(yaws))))
 
 
-def test_unseen_sides_have_surfaces_of_one_colour():
+def test_unseen_sides_have_surfaces_of_one_colour(plain):
     depth = place(human_of(COLOURS), BodyPose.rest()).position[:, 2]
     front, back = depth.argmax()[None], depth.argmin()[None]
     ones = torch.ones(2, S**3)
@@ -72,12 +79,10 @@ def test_unseen_sides_have_surfaces_of_one_colour():
         torch.stack([ones[0], 0.5 * ones[0]]), torch.tensor([True, False]), torch.tensor([False, True]),
         *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0],
     )  # fmt: skip
-    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
-    plain, found = (
-        encode_srgb(reconstruct(dataclasses.replace(MODEL, surfaces=each), person).payload.rgb)
-        for each in (None, surfaces)
-    )
-    torch.testing.assert_close(found[back], 0.5 * plain[back], atol=0.02, rtol=0)
+    person, free, _ = plain
+    found = reconstruct(dataclasses.replace(MODEL, surfaces=surfaces), person)
+    before, after = (encode_srgb(human.payload.rgb[back]) for human in (free, found))
+    torch.testing.assert_close(after, 0.5 * before, atol=0.02, rtol=0)
 
 
 def test_the_more_views_the_nearer_the_human_is_to_what_they_show():
@@ -105,10 +110,9 @@ def test_smaller_pictures_are_what_their_cameras_see():
         assert (drawn - target.rgba).abs().mean() < 0.012
 
 
-def test_every_step_is_reported_and_an_exception_cancels():
-    person, steps = captured(human_of(COLOURS), BodyPose.rest(), [0.0]), []
-    reconstruct(MODEL, person, on_step=lambda: steps.append(None))
-    assert len(steps) == steps_of(MODEL) > HUMAN_STEPS
+def test_every_step_is_reported_and_an_exception_cancels(plain):
+    person, _, steps = plain
+    assert steps == steps_of(MODEL) > HUMAN_STEPS
     assert steps_of(tiny_encoder()) == 0
 
     def cancel() -> None:
@@ -189,24 +193,23 @@ def test_the_voxels_follow_the_given_view_beyond_the_linear_fit(monkeypatch):
     noisy = dataclasses.replace(human, payload=dataclasses.replace(human.payload, rgb=noise))
     person = captured(noisy, BodyPose.rest(), [0.0])
     (target,) = targets_of(person.views, [frames_of(human)], 128)
-
-    def found() -> tuple[Payload, float]:
-        payload = reconstruct(MODEL, person).payload
-        drawn = march(Primitives.place(target.frames, payload), target.camera)
-        return payload, float((encode_srgb(drawn.rgb) - encode_srgb(target.rgba[..., :3])).square().mean())
-
-    payload, error = found()
-    monkeypatch.setattr(from_captures, "descend", lambda start, *_: start)
-    linear, before = found()
-    assert error < 0.8 * before
+    starts = []
+    monkeypatch.setattr(from_captures, "descend", lambda start, *how: starts.append(start) or descend(start, *how))
+    found = reconstruct(MODEL, person).payload
+    (linear,) = starts
+    before, after = (
+        (encode_srgb(drawn.rgb) - encode_srgb(target.rgba[..., :3])).square().mean()
+        for drawn in (march(Primitives.place(target.frames, one), target.camera) for one in (linear, found))
+    )
+    assert after < 0.8 * before
     behind = frames_of(human).rotation[:, 2, 2] < -0.7
-    assert (payload.rgb[behind] - linear.rgb[behind]).abs().mean() < 0.01
+    assert (found.rgb[behind] - linear.rgb[behind]).abs().mean() < 0.01
 
 
-def test_a_seed_draws_the_rest_too():
-    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
+def test_a_seed_draws_the_rest_too(plain, monkeypatch):
+    monkeypatch.setattr(from_captures, "descend", lambda start, *_: start)
     behind = frames_of(human_of(COLOURS)).rotation[:, 2, 2] < -0.7
-    one, other = (reconstruct(MODEL, person, seed=seed).payload.density[behind] for seed in (1, 2))
+    one, other = (human.payload.density[behind] for human in draw_humans(MODEL, plain[0], (1, 2)))
     assert (one - other).abs().mean() > 0.1  # coefficients are of colours alone
     components = PriorFit.of(MODEL)
     rest = components.drawn_rest(COLOURS, torch.Generator().manual_seed(0))

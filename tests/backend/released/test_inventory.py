@@ -11,7 +11,7 @@ from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.released.inventory import take_inventory
 from primdiffusion.released.reading import read_weights
-from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.failures import to_user_error
 from released_files import SMALL, T, blank, save_released, schedule_buffers, stage_one, state, template
 from support.errors import refused
 
@@ -190,4 +190,4 @@ def test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file(tmp
         torch.save({name: torch.zeros(2) for name in each}, path)
         with refused(FileError, str(path)) as caught:
             read_released(path)
-        assert len(str(describe(caught.value))) - len(str(tmp_path)) <= 300
+        assert len(str(to_user_error(caught.value))) - len(str(tmp_path)) <= 300

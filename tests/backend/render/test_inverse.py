@@ -15,7 +15,6 @@ from primdiffusion.render.cpu.march import march_cpu
 from primdiffusion.render.descent import LARGEST_CHANGE, DescentSettings, descend, render_view
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import (
-    BACKGROUND,
     InverseSettings,
     fit_colours,
     fit_payload,
@@ -158,13 +157,6 @@ def test_a_mesh_without_textures_is_named():
         fitted_payloads([TexturedMesh((bare,))], FRAMES, np.zeros(10), None)
     with refused(ValueError, "colouring"):
         fitted_payloads([], FRAMES, np.zeros(10), None)
-
-
-def over_grey(payload: Payload, camera: Camera) -> np.ndarray:
-    """Pixels of an image: colour over the background of fits, and alpha."""
-    drawn = march_cpu(Primitives.place(FRAMES, payload), camera)
-    rgb = drawn.rgb + (1 - drawn.alpha[..., None]) * BACKGROUND
-    return torch.cat([rgb, drawn.alpha[..., None]], -1).flatten(0, 1).double().numpy()
 
 
 STEPS = 60

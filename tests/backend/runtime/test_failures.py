@@ -7,7 +7,7 @@ import torch
 from primdiffusion import cli
 from primdiffusion.files.regular_files import FileError, printable
 from primdiffusion.formats.schema import FieldError
-from primdiffusion.runtime.failures import PictureOutOfMemory, describe, traceback_of
+from primdiffusion.runtime.failures import PictureOutOfMemory, to_user_error, traceback_of
 
 
 @pytest.mark.parametrize("error", [FieldError(("views", 2), "is 0: give 1"), PictureOutOfMemory(30, 40)])
@@ -19,14 +19,14 @@ def test_an_error_of_a_worker_process_says_the_same_in_its_parent(error):
 def test_torch_out_of_memory_on_the_cpu_is_named():
     with pytest.raises(RuntimeError) as error:
         torch.empty(10**15)
-    failure = describe(error.value)
+    failure = to_user_error(error.value)
     assert failure.kind == "out_of_memory"
     assert failure.sentence == "the machine ran out of memory when it asked for 4000000000000000 bytes more"
 
 
 def test_cuda_out_of_memory_is_named():
     error = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of ...")
-    failure = describe(error)
+    failure = to_user_error(error)
     assert failure.kind == "out_of_memory"
     assert failure.sentence == "the graphics card ran out of memory when it asked for 20.00 GiB more"
     assert failure.remedy
@@ -53,7 +53,7 @@ def test_cuda_out_of_memory_is_named():
     ],
 )
 def test_a_domain_error_is_one_sentence_of_its_kind(error, kind, text):
-    failure = describe(error)
+    failure = to_user_error(error)
     assert failure.kind == kind
     assert text in failure.sentence
     assert "\n" not in str(failure)
@@ -76,8 +76,8 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp.exe"
     ids=lambda error: type(error).__name__,
 )
 def test_no_terminal_escape_of_a_file_is_in_a_sentence(error):
-    assert "owned" in describe(error).sentence
-    assert str(describe(error)).isprintable()
+    assert "owned" in to_user_error(error).sentence
+    assert str(to_user_error(error)).isprintable()
 
 
 def test_no_terminal_escape_is_in_a_traceback():
@@ -103,7 +103,7 @@ def test_the_command_line_prints_no_escape(tmp_path, capsys):
 
 @pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("shape mismatch"), TypeError(), AssertionError()])
 def test_a_defect_is_not_dressed_up_as_the_users_mistake(error):
-    assert describe(error) is None
+    assert to_user_error(error) is None
 
 
 @pytest.mark.parametrize(
@@ -115,6 +115,6 @@ def test_a_defect_is_not_dressed_up_as_the_users_mistake(error):
     ],
 )
 def test_long_values_of_a_file_are_cut_and_paths_stay(given, shown):
-    sentence = str(describe(ValueError(given)))
+    sentence = str(to_user_error(ValueError(given)))
     assert sentence.startswith(shown)
     assert len(sentence) < 250

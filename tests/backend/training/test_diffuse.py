@@ -1,4 +1,4 @@
-"""Runs of stage 2: what they leave, how they go on, and what they refuse; both presets."""
+"""Runs of stage 2: what they leave, how they go on, what they refuse, and how processes share them; both presets."""
 
 import dataclasses
 import itertools
@@ -27,8 +27,9 @@ from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.diffusion_task import SlabTask
-from primdiffusion.training.loop import Interrupt, Step, step_seed
+from primdiffusion.training.loop import Interrupt, TrainingStep, step_seed
 from primdiffusion.training.losses import LEVELS
+from safetensors.torch import load_file
 from support.errors import refused
 from support.runs import child_environment, rows, same_tensors, sentence, timeless
 
@@ -75,7 +76,7 @@ def after(steps):
 
 
 def first_step():
-    return Step(0, torch.Generator().manual_seed(0), {})
+    return TrainingStep(0, torch.Generator().manual_seed(0), {})
 
 
 def test_a_run_leaves_settings_people_metrics_pictures_states_and_a_model(people, whole):
@@ -299,7 +300,7 @@ def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypat
 )
 def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
     given = {"steps": 1, "batch": 1} if settings_of is NetworkTraining else {"data": Path("a"), "run": Path("b")}
-    with pytest.raises(ValueError, match=word):
+    with refused(ValueError, word):
         settings_of(**{**given, **changes})
 
 
@@ -309,3 +310,39 @@ def test_too_few_humans_for_the_person_components_are_counted_before_anything_is
     with refused(ValueError, "5 humans", f"{5 * variants} colourings", "192", "--prior.components"):
         train(settings(tmp_path / "people", tmp_path / "run", prior=PriorConfig()))
     assert not (tmp_path / "run" / "prepared.safetensors").exists()
+
+
+SCRIPT = Path(__file__).parents[1] / "diffuse_runs.py"
+LOCAL = {"steps": 2, "batch": 4, "evaluate_every": 2}
+TWINS = {step_seed(0, "local", step, 0): step_seed(0, "local", step, 1) for step in range(2)}
+"""Seeds of the second process by those of the first."""
+ALONE = CellTask.loss
+
+
+def of_both(task, step):
+    """The mean of what two processes would compute, each with numbers of its own."""
+    losses = []
+    for seed in (step.generator.initial_seed(), TWINS[step.generator.initial_seed()]):
+        torch.manual_seed(seed)
+        losses.append(ALONE(task, dataclasses.replace(step, generator=torch.Generator().manual_seed(seed)))["loss"])
+    return {"loss": torch.stack(losses).mean()}
+
+
+@pytest.mark.slow
+def test_two_processes_train_on_batches_of_their_own_and_average_gradients(people, tmp_path, monkeypatch):
+    launcher = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--", str(SCRIPT))
+    done = subprocess.run(
+        [sys.executable, "-m", *launcher, str(people), str(tmp_path / "two"), json.dumps(LOCAL)],
+        env=child_environment(), capture_output=True, text=True, timeout=500, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (tmp_path / "two").iterdir()} == DEFAULT_FILES
+    assert logged(tmp_path / "two") == [1, 2]
+    assert json.loads((tmp_path / "two" / "run.json").read_text())["starts"][0]["processes"] == 2
+    assert load_checkpoint(tmp_path / "two" / MODEL).card["batch"] == {"local": 8}
+    monkeypatch.setattr(CellTask, "loss", of_both)
+    train(settings(people, tmp_path / "one", local=NetworkTraining(**LOCAL)))
+    states = [load_file(tmp_path / folder / "state.safetensors") for folder in ("two", "one")]
+    for key, value in states[0].items():
+        if key.startswith(("network.", "average.")):
+            assert torch.allclose(value, states[1][key], atol=1e-5), key

@@ -1,16 +1,18 @@
-"""A run of stage 1: what it leaves, when it stops, and what it says of bad input."""
+"""A run of stage 1: what it leaves, when it stops, what it says of bad input, and how several processes share it."""
 
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from capture_scenes import save_person
-from fit_scenes import STATE, WHOLE, files, flags, forget_processes, patched_person, settings, stop_after
+from capture_scenes import captured, save_person
+from fit_scenes import STATE, WHOLE, files, flags, forget_processes, logged, patched_person, settings, stop_after
 from PIL import Image
 from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.poses import built_in_poses
@@ -29,11 +31,12 @@ from primdiffusion.training.loop import begin_training
 from primdiffusion.training.run_folder import METRICS, PICTURES, Metrics
 from safetensors.torch import load_file
 from support.errors import refused
-from support.runs import rows, sentence
+from support.runs import child_environment, rows, sentence
 
 pytestmark = pytest.mark.usefixtures("small_fit")
 
 ROOT = Path(__file__).parents[3]
+SCRIPT = Path(__file__).parents[1] / "fit_scenes.py"
 
 
 @pytest.fixture
@@ -54,11 +57,9 @@ def test_a_run_leaves_settings_versions_metrics_pictures_state_and_encoder(captu
     assert not (ROOT / ".git").exists() or about["starts"][0]["commit"]
     (picture,) = (config.run / PICTURES).iterdir()
     assert Image.open(picture).size == (5 * 24, 2 * 24)
-    logged = [row for row in rows(config.run) if "rgb" in row]
-    assert [row["step"] for row in logged] == [1, 2, 3, 4]
+    assert logged(config.run) == [1, 2, 3, 4]
     terms = {"rgb", "silhouette", "volume", "gradient"}
-    times = {"seconds_step", "seconds"}
-    assert logged[0].keys() == {"step"} | terms | times
+    assert rows(config.run)[0].keys() == {"step", "seconds_step", "seconds"} | terms
     measured = [row for row in rows(config.run) if "psnr_train" in row]
     assert [row["step"] for row in measured] == [2, 4]
     assert all(np.isfinite([row["psnr_train"], row["psnr_held"]]).all() for row in measured)
@@ -145,7 +146,7 @@ def test_a_perceptual_weight_without_a_file_is_rejected_and_a_missing_file_named
 )  # fmt: skip
 def test_settings_that_cannot_be_are_named(captures, tmp_path, change):
     (name,) = change
-    with pytest.raises(ValueError, match=name):
+    with refused(ValueError, name):
         settings(captures, tmp_path / "run", **change)
 
 
@@ -259,6 +260,42 @@ def test_biases_of_places_learn_so_many_times_as_fast_as_weights(captures, tmp_p
 
 def first_task(config: FitConfig) -> EncoderTask:
     return EncoderTask(config, open_captures(config.data), Accelerator(cpu=True))
+
+
+def launched(*words: str) -> subprocess.CompletedProcess:
+    """A run as `accelerate launch` or `torchrun` start it."""
+    command = [sys.executable, "-m", *words]
+    return subprocess.run(command, env=child_environment(), capture_output=True, text=True, timeout=500, check=False)
+
+
+@pytest.mark.slow
+def test_two_processes_of_one_person_train_as_one_of_two_and_save_once(tmp_path):
+    captures = captured(tmp_path / "captures", people=3, frames=2, passes=("img", "mask"))
+    config = settings(captures, tmp_path / "two", steps=2)
+    launcher = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--")  # or --run reads as --run-path
+    done = launched(*launcher, str(SCRIPT), "fit", *flags(config))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"{config.run / MODEL}  2 of 2 steps\n"
+    assert files(config.run) == WHOLE
+    assert logged(config.run) == [1, 2]
+    assert json.loads((config.run / "run.json").read_text())["starts"][0]["processes"] == 2
+    assert load_encoder(config.run / MODEL).card["batch"] == 2
+    one = settings(captures, tmp_path / "one", steps=2, batch=2)
+    fit(one)
+    states = [load_file(run / STATE) for run in (config.run, one.run)]
+    assert states[0].keys() == states[1].keys()
+    for name, value in states[0].items():
+        if name.startswith(("network.", "average.")):
+            assert torch.allclose(value, states[1][name], atol=1e-5), name
+
+
+@pytest.mark.slow
+def test_accelerate_launches_the_command(captures, tmp_path):
+    config = settings(captures, tmp_path / "run", steps=1)
+    words = ("accelerate.commands.launch", "--cpu", "--num_processes", "1", str(SCRIPT), "fit")
+    done = launched(*words, *flags(config))
+    assert done.returncode == 0, done.stderr
+    assert files(config.run) == WHOLE
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ class NetTask(DiffusionTask):
     def network(self):
         return self.net
 
-    def put(self, network):
+    def use_network(self, network):
         self.net = network
 
     def loss(self, step): ...

@@ -147,7 +147,7 @@ def test_the_work_ends_when_its_owner_says_so(views):
     ],
 )
 def test_what_cannot_be_refined_is_rejected_in_a_sentence(views, broken, sentence):
-    with pytest.raises(ValueError, match=sentence):
+    with refused(ValueError, sentence):
         refine(*broken(person(2), views[0]), QUICK)
 
 

@@ -26,7 +26,7 @@ from blender_primdiffusion.capture.cameras import aim, view_of
 from blender_primdiffusion.capture.job import run
 from blender_primdiffusion.capture.passes import read_colours, read_exr, srgb_bytes, write_passes
 from blender_primdiffusion.capture.settings import CaptureSettings
-from blender_primdiffusion.capture.stage import Stage, shoot_centres, shoot_colours
+from blender_primdiffusion.capture.stage import CaptureScene, shoot_centres, shoot_colours
 from blender_primdiffusion.capture.surfaces import mark_parts, prepare_materials
 from blender_primdiffusion.files import picture_files
 from blender_primdiffusion.scene.convention import points_to_blender
@@ -44,12 +44,12 @@ def odd_view() -> View:
 @pytest.fixture
 def stage(empty_scene, tmp_path):
     settings = CaptureSettings(tmp_path / "out", rig=Rig(count=3, width=SIZE, height=SIZE), samples=16, device="cpu")
-    made = Stage(empty_scene, settings)
+    made = CaptureScene(empty_scene, settings)
     yield made
     made.close()
 
 
-def put(stage: Stage, frame: int = 1, **materials) -> PaintedPerson:
+def put(stage: CaptureScene, frame: int = 1, **materials) -> PaintedPerson:
     with stage.entered() as own:
         person = PaintedPerson(own, read_body(), materials.get("paint") or plain((0.5, 0.25, 0.1)))
         person.pose(POSES.rotations[frame], POSES.translations[frame])
@@ -59,7 +59,7 @@ def put(stage: Stage, frame: int = 1, **materials) -> PaintedPerson:
     return person
 
 
-def sphere(stage: Stage, centre, radius: float, paint: bpy.types.Material) -> bpy.types.Object:
+def sphere(stage: CaptureScene, centre, radius: float, paint: bpy.types.Material) -> bpy.types.Object:
     with stage.entered() as own:
         ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
         mesh = bpy.data.meshes.new("ball")

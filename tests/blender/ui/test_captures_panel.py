@@ -21,7 +21,7 @@ from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.command import MARK, main, parse, settings_of
 from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
-from blender_primdiffusion.jobs.follow import Session
+from blender_primdiffusion.jobs.follow import StepRunner
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui import captures_panel
@@ -213,7 +213,7 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
 def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, tmp_path, message, fault):
     program = f"import time; print({MARK + message!r}, flush=True); time.sleep(600)"
     monkeypatch.setattr(captures_panel, "child_command", lambda: [sys.executable, "-c", program])
-    session = Session("", "")
+    session = StepRunner("", "")
     session.start(captures_panel.capturing([], tmp_path / "folder"))
     end = time.monotonic() + 300
     while session.busy and time.monotonic() < end:

@@ -97,7 +97,7 @@ def read_bvh(path: Path) -> tuple[Motion, NDArray[np.float64]]:
     """The motion of a BVH file on SMPL's skeleton, y up judging by the rest pose, and the rotation [3, 3] from the
     file's axes.
 
-    See `rigs.retarget`. Where the rest is no pose of a person (as Rokoko writes it, all bones along x), a frame in
+    See `rigs.retarget`. Where the rest is not a pose of a person (as Rokoko writes it, all bones along x), a frame in
     which the person stands with straight limbs takes its place.
 
     The root's path is scaled by the length of the legs, so feet slide little. Positions of joints other than the
@@ -195,7 +195,7 @@ def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.floa
     if len(text) - found.end() > LONGEST_NUMBER * frames * columns + LONGEST_HIERARCHY:
         raise ValueError(f"much more than the {frames} frames of {columns} numbers that are announced")
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # numpy warns, or newer ones fail, at the first word that is no number
+        warnings.simplefilter("error")  # numpy warns, or newer ones fail, at the first word that is not a number
         try:
             numbers = np.fromstring(text[found.end() :], np.float64, sep=" ")
         except (DeprecationWarning, ValueError) as e:
@@ -262,7 +262,7 @@ def _unit(heads: dict[str, NDArray]) -> tuple[float, str]:
 
     length = leg(heads)
     if not length > 0:
-        raise ValueError("the legs have no length: this is no rest pose of a person")
+        raise ValueError("the legs have no length: this is not a rest pose of a person")
     metres = leg(dict(zip(JOINT_NAMES, REST_JOINTS, strict=True))) / length
     nearest = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] / metres)))
     return metres, nearest if abs(np.log(_UNITS[nearest] / metres)) < 0.4 else "a unit of its own"

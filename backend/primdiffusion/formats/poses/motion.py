@@ -25,7 +25,7 @@ NUMBERS_A_BYTE = 4
 
 @dataclasses.dataclass(frozen=True)
 class Detected:
-    """What was detected in a file, for the user to see and correct."""
+    """Properties detected in a file, for the user to check and correct."""
 
     rig: str = ""
     """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where unknown."""
@@ -46,9 +46,9 @@ class Detected:
 
 
 LARGEST_NUMBER = 1e6
-"""Of angles and lengths in files, in any unit: larger angles have few digits left after the point."""
+"""Largest angle or length in a file, in any unit: larger angles have few digits left after the point."""
 MOST_NUMBERS = 40_000_000
-"""Of an array: an hour of SMPL-X at 60 frames/s has 36 million."""
+"""Largest number of values in an array: an hour of SMPL-X at 60 frames/s has 36 million."""
 LARGEST_FPS, SMALLEST_FPS = 10_000.0, 0.1
 DEFAULT_FPS = 30.0
 """Frame rate of motion whose file does not state it."""

@@ -127,7 +127,7 @@ _LISTED = 36
 
 @dataclasses.dataclass(frozen=True)
 class BoneMap:
-    """Which bone of a rig is which joint."""
+    """Bones of a rig by SMPL's joints."""
 
     rig: str
     """A key of `RIGS`."""
@@ -167,10 +167,10 @@ def facing(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
 
     `heads` are joint positions by SMPL's names. Rest poses stand upright, so up is snapped to the nearest axis unless
     it is far off, and left where it nearly is an axis. Raises ValueError where the joints lie on a line, or the trunk
-    does not continue the legs: bones that all lie along one axis at rest are no pose.
+    does not continue the legs: bones that all lie along one axis at rest are not a pose.
     """
     if not is_standing(heads):
-        raise ValueError("the shoulders are not above the hips, and these above the ankles: this is no rest pose")
+        raise ValueError("the shoulders are not above the hips, and these above the ankles: this is not a rest pose")
     hips = (heads["left_hip"] + heads["right_hip"]) / 2
     shoulders = (heads["left_shoulder"] + heads["right_shoulder"]) / 2
     ankles = (heads["left_ankle"] + heads["right_ankle"]) / 2
@@ -181,7 +181,7 @@ def facing(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
     left = left - up * (left @ up)
     width = np.linalg.norm(left)
     if height < _SHORTEST or width < 1e-3 * height:
-        raise ValueError("hips, shoulders and ankles lie on a line: this is no rest pose of a person")
+        raise ValueError("hips, shoulders and ankles lie on a line: this is not a rest pose of a person")
     left = _towards_axis(left / width, 5.0)
     left = left - up * (left @ up)
     left /= np.linalg.norm(left)
@@ -224,7 +224,7 @@ def retarget(
 
     Each body part gets its bone's rotation in the world; the difference between the rig's rest pose and SMPL's T is
     added (`rig_from_smpl`). `rest` are places of bones at rest [3] and `turned` their rotations in the world from there
-    [F, 3, 3], by name. A joint without a bone follows its parent. Raises ValueError where `rest` is no person.
+    [F, 3, 3], by name. A joint without a bone follows its parent. Raises ValueError where `rest` is not a person.
     """
     heads = {joint: rest[bone] for joint, bone in bones.joints.items()}
     tips = {joint: rest[bone] for joint, bone in bones.tips.items()}

@@ -48,7 +48,7 @@ class ImageRows(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where each ray becomes opaque, as the adjoint needs it. Not filled if empty."""
+    """The point at which each ray becomes opaque, for the adjoint. Not filled if empty."""
 
     index: Int64[ndarray, "r"]
     """Lattice index in units of the smallest stride; NEVER if the ray stays transparent."""
