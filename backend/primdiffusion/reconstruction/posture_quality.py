@@ -38,11 +38,11 @@ LIMITS: Mapping[str, float] = {
     "left_out": 0.1,
     "outside": 0.28,
     "foot": 0.2,
-    "hand": 0.13,
-    "hands": 0.08,
+    "hand": 0.2,
+    "hands": 0.04,
     "hidden": 0.75,
     "head": 0.06,
-    "skin": 0.8,
+    "skin": 0.77,
     "joint": 1.0,
 }
 """Values that fits of whole people in good masks stay below (`benchmarks/plain_pictures.py spoiled`)."""
@@ -93,7 +93,8 @@ class FitQuality(NamedTuple):
     hand: float
     """Mean difference of encoded colour at a hand, the larger one."""
     hands: float
-    """The picture's difference of encoded colour between the hands; 0 where the body does not face the camera."""
+    """The picture's difference of colour between the hands, but for brightness: a palm is lighter than a back. 0 where
+    the body does not face the camera."""
     hidden: float
     """Share of one hand that the body hides, by what is seen of the other; likewise."""
     head: float
@@ -237,8 +238,8 @@ def _hands_and_skin(limbs: Mapping[str, Float[Tensor, "H W"]], target: PosedView
     hands = [_mean(picture, share * (opacity > 0.5)) for share in drawn]
     skin = [((picture - own).abs().mean(-1, keepdim=True) < SKIN_DIFFERENCE).float() for own in hands]
     of_skin = max(float(_mean(one, limbs["head"] * (opacity > 0.5))) for one in skin)
-    seen = [float(share.sum()) for share in drawn]
-    return float((hands[0] - hands[1]).abs().mean()), 1 - min(seen) / max(*seen, 1e-6), 1 - of_skin
+    seen, hue = [float(share.sum()) for share in drawn], [own / own.sum().clamp_min(1e-3) for own in hands]
+    return float((hue[0] - hue[1]).abs().mean()), 1 - min(seen) / max(*seen, 1e-6), 1 - of_skin
 
 
 def _mean(values: Float[Tensor, "H W c"], weights: Float[Tensor, "H W"]) -> Float[Tensor, "c"]:
