@@ -66,11 +66,10 @@ class Photograph:
 
     def whole_mask(self) -> UInt8[np.ndarray, "H W"]:
         """The mask in the upright picture."""
-        box = (round(self.window.left), round(self.window.top))
-        side = (round(self.window.width), round(self.window.height))
-        whole = Image.new("L", (self.width, self.height))
-        whole.paste(Image.fromarray(self.rgba[..., 3]).resize(side, Image.Resampling.BILINEAR), box)
-        return np.asarray(whole)
+        window, scale = self.window, len(self.rgba) / self.window.width
+        place = (scale, 0, -scale * window.left, 0, scale, -scale * window.top)  # not by whole pixels
+        square, size = Image.fromarray(self.rgba[..., 3]), (self.width, self.height)
+        return np.asarray(square.transform(size, Image.Transform.AFFINE, place, Image.Resampling.BILINEAR))
 
     def lens(self) -> View:
         """A level camera at the origin that sees the upright picture: the stated lens, or LONG_SIDE_DEGREES."""

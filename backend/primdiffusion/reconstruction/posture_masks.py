@@ -23,6 +23,8 @@ from primdiffusion.render.march import march
 
 INNER, OUTER = 0.018, 0.045
 """Widths of the bands within and around the outline in which it is sought, as shares of its height."""
+THIN = 0.8
+"""Share of the depth nearby from which a part that is thinner than the inner band, such as a hand, is inside."""
 ITERATIONS = 5
 
 
@@ -47,11 +49,12 @@ def cut_out(pixels: UInt8[np.ndarray, "H W 3"], outline: Bool[np.ndarray, "H W"]
     height = int(outline.any(1).sum())
     if not height:
         return np.zeros(outline.shape, np.uint8)
-    inside = np.asarray(ndimage.distance_transform_edt(np.pad(outline, 1)))[1:-1, 1:-1] > INNER * height
+    depth = np.asarray(ndimage.distance_transform_edt(np.pad(outline, 1)))[1:-1, 1:-1]
+    deepest = ndimage.maximum_filter(depth, 2 * int(INNER * height) + 1)
+    inside = outline & (depth > np.minimum(INNER * height, THIN * deepest))
     near = np.asarray(ndimage.distance_transform_edt(~outline)) <= OUTER * height
     state = np.where(near, cv2.GC_PR_BGD, cv2.GC_BGD)
-    state[outline] = cv2.GC_PR_FGD
-    state[inside] = cv2.GC_FGD
+    state[inside] = cv2.GC_FGD  # the band teaches its colours to the background: a body's outline covers some of it
     state, colours = state.astype(np.uint8), np.ascontiguousarray(pixels[..., ::-1])
     cv2.setRNGSeed(0)
     if inside.any() and not near.all():

@@ -38,12 +38,15 @@ LIMITS: Mapping[str, float] = {
     "left_out": 0.1,
     "outside": 0.28,
     "foot": 0.2,
-    "hand": 0.13,
+    "hand": 0.2,
+    "hands": 0.04,
+    "hidden": 0.75,
     "head": 0.06,
+    "skin": 0.77,
     "joint": 1.0,
 }
 """Values that fits of whole people in good masks stay below (`benchmarks/plain_pictures.py spoiled`)."""
-COLOUR_STEPS = 2
+COLOUR_STEPS = 3
 """Gauss-Newton steps to the person coefficients that draw the colours."""
 EDGE_PX = 1
 """Difference of outlines that does not count, pixels of the small pictures that are compared."""
@@ -53,6 +56,10 @@ faces are not drawn exactly.
 """
 LARGEST_DIFFERENCE, HEAD_SHARE = 0.1, 0.25
 """Largest difference of encoded colour that counts where pictures of a person are compared, and weight of the head."""
+SKIN_DIFFERENCE = 0.1
+"""Difference of encoded colour from that of a hand, up to which a pixel of the head is skin."""
+FRONT = 0.5
+"""Cosine of the angle to the camera from which a body shows face and hands."""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
 """How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {
@@ -85,8 +92,15 @@ class FitQuality(NamedTuple):
     """Share of a foot outside of the mask, the larger one."""
     hand: float
     """Mean difference of encoded colour at a hand, the larger one."""
+    hands: float
+    """The picture's difference of colour between the hands, but for brightness: a palm is lighter than a back. 0 where
+    the body does not face the camera."""
+    hidden: float
+    """Share of one hand that the body hides, by what is seen of the other; likewise."""
     head: float
-    """The same of means over small squares at the head."""
+    """The same difference as at a hand, of means over small squares, at the head."""
+    skin: float
+    """Share of the head that has not the colour of a hand; likewise."""
     joint: float
     """Angle of a knee or an elbow, by how far it can bend in that direction, the largest."""
     limb: str
@@ -124,8 +138,11 @@ class FitQuality(NamedTuple):
                 "left_out": "too much of the mask was left out",
                 "outside": f"the {self.limb} lies outside of the mask",
                 "foot": "a foot lies outside of the mask: it is hidden or cut off",
-                "hand": "a hand is not where the body has it: it is hidden, cut off, or seen from behind",
-                "head": "the head is not that of a person seen from the front",
+                **dict.fromkeys(
+                    ("hand", "hands", "hidden"),
+                    "a hand is not where the body has it: it is hidden, cut off, or seen from behind",
+                ),
+                **dict.fromkeys(("head", "skin"), "the head is not that of a person seen from the front"),
                 "joint": "a knee or an elbow bends as it cannot",
             }[self.worst]
             warnings.append(
@@ -146,8 +163,11 @@ def quality_of(
     for _ in range(COLOUR_STEPS):
         people = components.closer(people, targets)
     payload = components.payload(components.coefficients(people))
-    pairs = zip(each(posture.pose), targets, strict=True)
-    return min((_quality(payload, pose, target, left_out) for pose, target in pairs), key=lambda one: one.percent)
+    found = []
+    for pose, target, facing in zip(each(posture.pose), targets, posture.facing.tolist(), strict=True):
+        one = _quality(payload, pose, target, left_out)
+        found.append(one if facing > FRONT else one._replace(hands=0.0, hidden=0.0, skin=0.0))
+    return min(found, key=lambda one: one.percent)
 
 
 @torch.no_grad()
@@ -180,7 +200,8 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
     differs = difference.abs().mean(-1)
     inside = _mean_around(difference, inner, PATTERN_PX).abs().mean(-1)[inner]
     of_head, outside, colour = _mean_around(difference, inner, HEAD_PX).abs().mean(-1), {}, {"head": 0.0}
-    for limb, share in _limbs_drawn(payload, target).items():
+    drawn_limbs = _limbs_drawn(payload, target)
+    for limb, share in drawn_limbs.items():
         within = share * mask
         outside[limb] = 1 - float(within.sum() / share.sum().clamp_min(1e-6)) if share.sum() else 0.0
         weights, values = (share * inner, of_head) if limb == "head" else (within, differs)
@@ -191,6 +212,7 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
     )
     outside = {limb: share for limb, share in outside.items() if limb.endswith(("forearm", "lower leg"))}
     limb = max(outside, key=lambda name: outside[name])
+    hands, hidden, skin = _hands_and_skin(drawn_limbs, target)
     return FitQuality(
         outline=float(wrong.sum() / (mask | drawn).sum()),
         colour=float(inside.quantile(0.9)) if len(inside) else 1.0,
@@ -199,10 +221,30 @@ def _quality(payload: Payload, pose: BodyPose, target: PosedView, left_out: floa
         outside=outside[limb],
         foot=foot,
         hand=hand,
+        hands=hands,
+        hidden=hidden,
         head=colour["head"],
+        skin=skin,
         joint=_strain(pose),
         limb=limb,
     )
+
+
+def _hands_and_skin(limbs: Mapping[str, Float[Tensor, "H W"]], target: PosedView) -> tuple[float, float, float]:
+    """`FitQuality.hands`, `hidden` and `skin`, of the picture's colours where these limbs are drawn."""
+    opacity = target.rgba[..., 3]
+    picture = encode_srgb((target.rgba[..., :3] / opacity[..., None].clamp_min(0.1)).clamp(1e-4, 1))
+    drawn = [limbs[f"{side} hand"] for side in ("left", "right")]
+    hands = [_mean(picture, share * (opacity > 0.5)) for share in drawn]
+    skin = [((picture - own).abs().mean(-1, keepdim=True) < SKIN_DIFFERENCE).float() for own in hands]
+    of_skin = max(float(_mean(one, limbs["head"] * (opacity > 0.5))) for one in skin)
+    seen, hue = [float(share.sum()) for share in drawn], [own / own.sum().clamp_min(1e-3) for own in hands]
+    return float((hue[0] - hue[1]).abs().mean()), 1 - min(seen) / max(*seen, 1e-6), 1 - of_skin
+
+
+def _mean(values: Float[Tensor, "H W c"], weights: Float[Tensor, "H W"]) -> Float[Tensor, "c"]:
+    """By weights; 0 where they are."""
+    return (values * weights[..., None]).sum((0, 1)) / weights.sum().clamp_min(1e-6)
 
 
 def _mean_around(values: Float[Tensor, "H W 3"], inner: Bool[Tensor, "H W"], side: int) -> Float[Tensor, "H W 3"]:

@@ -55,6 +55,17 @@ def test_the_square_around_the_person_is_what_the_window_says(tmp_path):
     assert edges == pytest.approx([150, 190, 30, 150], abs=1.5 * scale)
 
 
+@pytest.mark.parametrize("box", [(60, 20, 101, 141), (150, 30, 190, 151)])
+def test_the_mask_of_a_square_lies_in_the_picture_where_it_was(tmp_path, box):
+    """Windows do not begin at whole pixels."""
+    picture, mask = figure(box=box)
+    (found,) = read_photographs([cut_out(tmp_path / "a.png", picture, mask)])
+    whole = found.whole_mask()
+    assert whole.shape == mask.shape
+    assert ndimage.center_of_mass(whole) == pytest.approx(ndimage.center_of_mass(mask), abs=0.02)
+    assert np.array_equal(whole > 127, mask > 127)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_pictures_are_upright_as_exif_says(tmp_path, orientation):
     picture, mask = figure()

@@ -34,6 +34,27 @@ def test_specks_of_the_persons_colour_beside_it_are_left():
     assert not cut_out(pixels, figure)[100:104, 85:88].any()
 
 
+def test_a_wall_whose_edge_the_outline_covers_is_not_the_person():
+    """Between the legs, as wide as the band about the outline: nothing farther away has its colour."""
+    pytest.importorskip("cv2")
+    pixels, figure = scene()
+    rows, columns = np.mgrid[:160, :120]
+    gap = (np.abs(columns - 60) < 6) & (rows > 90) & (rows < 140)
+    pixels[gap] = (200, 190, 40)
+    found = cut_out(pixels, figure & ~ndimage.binary_erosion(gap, iterations=2)) > 0
+    assert found[gap].mean() < 0.1
+    assert found[figure & ~gap].mean() > 0.97
+
+
+def test_a_thin_hand_of_the_walls_colour_is_kept_where_the_outline_has_it():
+    pytest.importorskip("cv2")
+    pixels, figure = scene()
+    rows, columns = np.mgrid[:160, :120]
+    hand = (np.abs(rows - 80) < 2) & (columns >= 80) & (columns < 95)
+    pixels[hand] = (60, 120, 90)
+    assert (cut_out(pixels, figure | hand) > 0)[hand & (rows == 80)].mean() > 0.7
+
+
 def test_without_an_outline_there_is_nobody():
     pytest.importorskip("cv2")
     pixels, figure = scene()

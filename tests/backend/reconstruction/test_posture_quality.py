@@ -150,6 +150,44 @@ def test_a_foot_that_the_mask_lacks_is_a_failed_fit():
     assert "a foot lies outside of the mask" in found.warnings()[0]
 
 
+def with_joint(joint: str, degrees: tuple[float, float, float], posture: Posture = POSTURE) -> Posture:
+    rotation = posture.pose.joint_rotation.clone()
+    rotation[0, JOINT_NAMES.index(joint)] = axis_angle_to_matrix(torch.tensor(degrees) * math.pi / 180)
+    return dataclasses.replace(posture, pose=dataclasses.replace(posture.pose, joint_rotation=rotation))
+
+
+def test_a_hand_behind_the_trunk_is_a_failed_fit_from_the_front_alone():
+    behind = with_joint("left_shoulder", (0.0, 100.0, 0.0))
+    found = quality(seen(behind)[0], behind)
+    assert found.hidden > LIMITS["hidden"]
+    assert "a hand is not where the body has it: it is hidden" in found.warnings()[-1]
+    turned = with_joint("pelvis", (0.0, 90.0, 0.0), behind)
+    from_side = quality(seen(turned)[0], turned)
+    assert (from_side.hands, from_side.hidden, from_side.skin) == (0, 0, 0)
+
+
+def test_a_hand_of_another_colour_than_the_other_is_a_failed_fit():
+    photograph, target = seen()
+    rgba, columns = photograph.rgba.copy(), np.flatnonzero(target.rgba[..., 3].any(0).numpy())
+    left = rgba[:, columns[-1] - 8 :]  # seen from the front
+    left[..., :3] = left[..., :3] * 0.7
+    assert quality(dataclasses.replace(photograph, rgba=rgba)).hands < LIMITS["hands"] / 2  # darker
+    left[..., :3] = left[..., 3:] * np.array([0.2, 0.5, 0.8])
+    found = quality(dataclasses.replace(photograph, rgba=rgba))
+    assert found.hands > 2 * LIMITS["hands"]
+    assert "a hand is not where the body has it" in found.warnings()[-1]
+
+
+def test_a_head_without_the_colour_of_hands_is_that_of_no_one_who_faces_the_camera():
+    photograph, target = seen()
+    rgba, rows = photograph.rgba.copy(), np.flatnonzero(target.rgba[..., 3].any(1).numpy())
+    rgba[rows[0] : rows[0] + len(rows) // 6, :, :3] //= 8
+    assert quality(photograph).skin < LIMITS["skin"]
+    found = quality(dataclasses.replace(photograph, rgba=rgba))
+    assert found.skin > LIMITS["skin"]
+    assert "the head is not that of a person seen from the front" in found.warnings()[-1]
+
+
 def test_a_head_of_other_colours_is_a_failed_fit():
     photograph, target = seen()
     rgba, rows = photograph.rgba.copy(), np.flatnonzero(target.rgba[..., 3].any(1).numpy())
@@ -164,9 +202,7 @@ def test_a_head_of_other_colours_is_a_failed_fit():
     ("joint", "turn"), [("left_knee", (0, 0, 40)), ("right_knee", (-40, 0, 0)), ("left_elbow", (0, 90, 0))]
 )
 def test_joints_that_bend_as_they_cannot_are_a_failed_fit(joint, turn):
-    rotation = POSTURE.pose.joint_rotation.clone()
-    rotation[0, JOINT_NAMES.index(joint)] = axis_angle_to_matrix(torch.tensor(turn) * math.pi / 180)
-    bent = dataclasses.replace(POSTURE, pose=dataclasses.replace(POSTURE.pose, joint_rotation=rotation))
+    bent = with_joint(joint, turn)
     found = quality(seen(bent)[0], bent)
     assert found.joint > 1
     assert found.percent < LEAST_PERCENT
