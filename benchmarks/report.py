@@ -97,7 +97,7 @@ HEAD = """# Results
 
 Numbers by scripts of `benchmarks/`, which write the records that each table names: they hold every other number, the
 versions and the commit. `benchmarks/report.py` makes this page from them. Figures of generated humans, of the codec and
-of one view are those of the default checkpoint of their date; the included one is of 2026-11-29.
+of one view are those of the default checkpoint of their date; the included one is of 2026-11-30.
 """
 
 

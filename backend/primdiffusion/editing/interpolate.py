@@ -44,8 +44,9 @@ def interpolate(
 
     Both are inverted with DDIM (Song et al. 2021, sec. 4.3), the noises are interpolated spherically, and the result is
     sampled with DDIM. The reconstruction residuals of a and b are interpolated and added, so that fractions 0 and 1
-    return them exactly. Betas are interpolated linearly. Needs no seed; deterministic as `human.generate`. The
-    provenance is that of the nearer end.
+    return them exactly. Each is denoised with its own attributes, and what lies between with those of the nearer end:
+    half of a tee and half of a suit is neither. Betas are interpolated linearly. Needs no seed; deterministic as
+    `human.generate`. The provenance is that of the nearer end.
 
         >>> between = pd.interpolate(model, human, varied, 0.5)
         >>> between.provenance["edits"][-1]["edit"]
@@ -116,7 +117,13 @@ def _between(
     model: DiffusionModel, people: tuple[Human, Human], fraction: float, chain: Sequence[int], on_step: OnStep | None
 ) -> Payload:
     ends = torch.cat([encoded(model, human) for human in people])
-    back = run_sampler(invert_and_sample(model.denoise, model.schedule, ends, fraction, chain), on_step)
+    read = model.read_condition(ends)
+    condition = None if read is None else torch.cat([read, read[round(fraction) :][:1]])
+
+    def denoise(x: Tensor, t: int) -> Tensor:
+        return model.denoise(x, t, None if condition is None else condition[: len(x)])
+
+    back = run_sampler(invert_and_sample(denoise, model.schedule, ends, fraction, chain), on_step)
     latent_residual = ends - back[:2]
     between = decoded(model, back[2:] + torch.lerp(latent_residual[:1], latent_residual[1:], fraction))
     residuals = [

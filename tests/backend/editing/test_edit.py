@@ -19,7 +19,7 @@ from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from support.errors import refused
-from support.tiny import random_human, slab_model, tiny_model
+from support.tiny import model_of_two_kinds, random_human, slab_model, tiny_model
 
 FIELDS = ("rgb", "density", "delta_scale")
 TOP = region_of(["top"])
@@ -253,6 +253,21 @@ def test_an_interpolation_leaves_its_ends_without_a_jump(human, other):
         edited = interpolate(small_model(), human, other, fraction, steps=3)
         assert distance(edited, end) < 2e-3
         assert distance(edited, end) < 0.01 * distance(human, other)
+
+
+def test_what_lies_between_has_the_attributes_of_the_nearer_end(monkeypatch):
+    model, conditions, denoise = model_of_two_kinds(), [], DiffusionModel.denoise
+    ends = [generate(model, 0, 3, attributes={"sex": sex}) for sex in ("female", "male")]
+
+    def noted(self, x, t, condition=None, guidance=1.0):
+        conditions.append(condition)
+        return denoise(self, x, t, condition, guidance)
+
+    monkeypatch.setattr(DiffusionModel, "denoise", noted)
+    for fraction, nearer in ((0.4, "jeans"), (0.6, "suit")):
+        interpolate(model, *ends, fraction, steps=3)
+        worn = [model.vocabulary.encode({"outfit": outfit}) for outfit in ("jeans", "suit", nearer)]
+        assert torch.stack([row @ outfit for row, outfit in zip(conditions[-1], worn, strict=True)]).min() > 0.99
 
 
 def test_betas_are_interpolated_linearly(human, other):
