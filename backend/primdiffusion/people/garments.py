@@ -97,7 +97,8 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
         if kind.trim:
             trim |= other
         if kind.smooth:
-            light = np.where(here, _blurred(light, seen & ~binary_dilation(other, iterations=RIM)), light)
+            near = np.asarray(binary_dilation(other, iterations=RIM), bool)
+            light = np.where(here, _blurred(light, seen & ~near), light)
         for region in (here & ~trim, here & trim):
             if (region & texels.inside).any():
                 middle = np.median(light[region & texels.inside])
