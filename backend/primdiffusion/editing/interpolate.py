@@ -117,8 +117,8 @@ def _between(
     model: DiffusionModel, people: tuple[Human, Human], fraction: float, chain: Sequence[int], on_step: OnStep | None
 ) -> Payload:
     ends = torch.cat([encoded(model, human) for human in people])
-    read = model.read_condition(ends)
-    condition = None if read is None else torch.cat([read, read[round(fraction) :][:1]])
+    of_ends = model.read_condition(ends)
+    condition = None if of_ends is None else torch.cat([of_ends, of_ends[int(fraction > 0.5)][None]])
 
     def denoise(x: Tensor, t: int) -> Tensor:
         return model.denoise(x, t, None if condition is None else condition[: len(x)])
