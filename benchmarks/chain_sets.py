@@ -34,7 +34,9 @@ from primdiffusion.people.payloads import (
     voxels_from_payload,
 )
 from primdiffusion.people.person import Person, make_person, recolour
+from primdiffusion.people.skirts import box_sizes
 from primdiffusion.people.stored_people import PersonVariants, read_payloads
+from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
@@ -202,7 +204,8 @@ def fit(
 ) -> tuple[list[Payload], float]:
     """Fitted payloads of colourings of one geometry, and the processor's seconds."""
     begun = time.process_time()
-    payloads = fitted_payloads([person.mesh for person in people], frames, people[0].betas, model, turn=turn)
+    sizes = box_sizes(attribute_labels(people[0].attributes)["outfit"])
+    payloads = fitted_payloads([person.mesh for person in people], frames, people[0].betas, model, sizes, turn=turn)
     return payloads, time.process_time() - begun
 
 

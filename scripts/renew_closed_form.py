@@ -30,6 +30,9 @@ from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.surfaces import fit_surfaces
 from torch import Tensor
 
+OF_FACES = ("face", "features", "by_skin", "skin")
+"""Fields of surfaces that do not depend on clothes."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -103,34 +106,40 @@ def outfits_of(people: LatentSet, vocabulary: AttributeVocabulary, config: Prior
 
 
 def with_clothes(base: Surfaces, renewed: Surfaces, outfits: Float[Tensor, "o a"]) -> Surfaces:
-    """The surfaces of `base`, but those of these outfits from `renewed`; below hair, hats and shoes."""
+    """The surfaces of `base`, but faces and those of these outfits from `renewed`; below hair, hats and shoes."""
     clothes = picked(renewed, (renewed.condition @ outfits.T > 0).any(1))
     others = picked(base, ~(base.condition @ outfits.T > 0).any(1))
     moved = dataclasses.replace(
         others,
         surface=others.surface + len(clothes.condition),
         garment=others.garment + len(clothes.condition),
+        skirt=others.skirt + len(clothes.condition),
         printed=others.printed + len(clothes.garment),
         box=others.box + len(clothes.surface),
     )
-    names = [field.name for field in dataclasses.fields(Surfaces)]
-    return Surfaces(*(torch.cat([getattr(clothes, name), getattr(moved, name)]) for name in names))
+    names = [field.name for field in dataclasses.fields(Surfaces) if field.name not in OF_FACES]
+    both = {name: torch.cat([getattr(clothes, name), getattr(moved, name)]) for name in names}
+    faces = renewed if len(renewed.face) else base
+    return Surfaces(**both, **{name: getattr(faces, name) for name in OF_FACES})
 
 
 def picked(surfaces: Surfaces, which: Bool[Tensor, "l"]) -> Surfaces:
     """Some of the surfaces, with their boxes and prints."""
-    rows, prints = which[surfaces.surface], which[surfaces.garment]
+    rows, prints, skirts = which[surfaces.surface], which[surfaces.garment], which[surfaces.skirt]
     printed = prints[surfaces.printed]
     number, row, print_ = (mask.cumsum(0) - 1 for mask in (which, rows, prints))
-    return Surfaces(
-        surfaces.condition[which],
-        surfaces.natural[which],
-        number[surfaces.surface[rows]],
-        *(getattr(surfaces, name)[rows] for name in ("cell", "share", "tone", "read", "drawn")),
-        number[surfaces.garment[prints]],
-        print_[surfaces.printed[printed]],
-        row[surfaces.box[printed]],
-        surfaces.second[printed],
+    return dataclasses.replace(
+        surfaces,
+        condition=surfaces.condition[which],
+        natural=surfaces.natural[which],
+        surface=number[surfaces.surface[rows]],
+        **{name: getattr(surfaces, name)[rows] for name in ("cell", "share", "tone", "read", "drawn")},
+        garment=number[surfaces.garment[prints]],
+        printed=print_[surfaces.printed[printed]],
+        box=row[surfaces.box[printed]],
+        second=surfaces.second[printed],
+        skirt=number[surfaces.skirt[skirts]],
+        **{name: getattr(surfaces, name)[skirts] for name in ("between", "dense", "size")},
     )
 
 

@@ -31,7 +31,7 @@ from primdiffusion.diffusion.model import (
     check_surfaces,
 )
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
-from primdiffusion.diffusion.surfaces import BRIGHTEST, Surfaces
+from primdiffusion.diffusion.surfaces import LARGEST, NUMBERS, Surfaces, without_faces_and_skirts
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.files import tensor_file
 from primdiffusion.files.arrays import LARGEST_NUMBER
@@ -359,13 +359,11 @@ def _is_halved(key: str, value: Tensor) -> bool:
 
 BYTE = 255.0
 """A stored share of 1, or the largest tone."""
-_OF_VOXELS = {"share": 1.0, "tone": BRIGHTEST, "second": 1.0}
-"""Fields of surfaces that are stored in bytes, and their largest values."""
 
 
 def store_surfaces(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Surfaces with shares and tones in bytes."""
-    in_bytes = {f"surfaces.{name}": tensors[f"surfaces.{name}"] / most for name, most in _OF_VOXELS.items()}
+    """Surfaces with values of voxels in bytes."""
+    in_bytes = {f"surfaces.{name}": tensors[f"surfaces.{name}"] / most for name, most in LARGEST.items()}
     return tensors | {key: (value * BYTE).round().to(torch.uint8) for key, value in in_bytes.items()}
 
 
@@ -373,9 +371,10 @@ def restore_surfaces(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabul
     """Undo `store_surfaces`; None without any. Raises ValueError, KeyError and TypeError where tensors do not fit."""
     if not tensors:
         return None
-    whole = {name: tensors[name].long() for name in ("surface", "cell", "garment", "printed", "box")}
+    tensors = {**without_faces_and_skirts(), **tensors}  # earlier checkpoints have neither
+    whole = {name: tensors[name].long() for name in NUMBERS}
     flags = {name: tensors[name].bool() for name in ("natural", "read", "drawn")}
-    of_voxels = {name: tensors[name].float() / BYTE * most for name, most in _OF_VOXELS.items()}
+    of_voxels = {name: tensors[name].float() / BYTE * most for name, most in LARGEST.items()}
     surfaces = Surfaces(**{**tensors, **whole, **flags, **of_voxels})
     check_surfaces(surfaces, vocabulary)
     return surfaces

@@ -17,7 +17,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule, trailing_steps
-from primdiffusion.diffusion.surfaces import BRIGHTEST, Surfaces
+from primdiffusion.diffusion.surfaces import LARGEST, LARGEST_SIZE, Surfaces
 from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord, check_shapes
 from primdiffusion.primitives.body_setup import BodySetup
@@ -159,14 +159,14 @@ class DiffusionModel:
     def decode(self, x0: Float[Tensor, "*b c h w"]) -> Payload:
         """The payload of clean samples: colours linear in [0, 1], densities 1/m >= 0, ordinary tensors.
 
-        Hair, hats, plain garments and skin have one colour each (`Surfaces`).
+        Hair, hats, plain garments and skin have one colour each, and skirts are whole (`Surfaces`).
         """
         prior = getattr(self.denoiser, "prior", None)
         if self.surfaces is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):
             return self.codec.to_payload(x0, self.full_density)
         codec, samples = self.codec.codec, x0.reshape(-1, *self.codec.shape)
         kind = prior.expected_kind(prior.split(samples)[0])
-        cells = self.surfaces.recolour(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
+        cells = self.surfaces.draw(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
         return payload_from_cells(cells, self.full_density, codec.zone)
 
     def read_condition(self, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b a"] | None:
@@ -305,11 +305,12 @@ def check_surfaces(surfaces: Surfaces, vocabulary: AttributeVocabulary) -> None:
         raise ValueError(f"surfaces are described by {surfaces.condition.shape[1]} values, not {vocabulary.width}")
     kinds, prints, boxes = len(surfaces.condition), len(surfaces.garment), len(surfaces.cell)
     limits = {"surface": kinds, "cell": K, "garment": kinds, "printed": prints, "box": boxes}
+    limits |= {"face": K, "skirt": kinds, "between": K}
     for name, count in limits.items():
         numbers = getattr(surfaces, name)
         if bool((numbers < 0).any()) or bool((numbers >= count).any()):
             raise ValueError(f"{name} has numbers that are not from 0 to {count - 1}")
-    for name, largest in {"share": 1.0, "tone": BRIGHTEST, "second": 1.0}.items():
+    for name, largest in {**LARGEST, "skin": 1.0, "size": LARGEST_SIZE}.items():
         values = getattr(surfaces, name)
         if bool((values < 0).any()) or bool((values > largest).any()):
             raise ValueError(f"{name} has values that are not from 0 to {largest:g}")

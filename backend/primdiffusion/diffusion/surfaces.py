@@ -7,6 +7,10 @@ everybody (`training.surfaces`).
 
 Person components also mix prints: a shirt between stripes and checks is neither. But a print is at the same place of a
 garment on everybody who has it, in two colours (`training.prints`).
+
+Dark faces would be blotched: what faces differ by is as large as their skin is bright, and in a Gaussian it is as large
+on all. And skirts would be torn: between the legs each person's cloth is at a place of its own, of which boxes show a
+part. But the boxes that are sized for a skirt (`people.skirts`) are nearly as dense on everybody who has it.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from primdiffusion.diffusion.codec import VOXEL_VALUES, window_weight
+from primdiffusion.diffusion.codec import SCALE_VALUE, VOXEL_VALUES, window_weight
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import S
 
@@ -25,6 +29,11 @@ SURELY = 0.75
 """Share of a surface above which a voxel counts for the surface's colour."""
 BRIGHTEST = 2.0
 """Largest tone."""
+LARGEST = {"share": 1.0, "tone": BRIGHTEST, "second": 1.0, "features": 1.0, "by_skin": BRIGHTEST, "dense": 1.0}
+"""Fields with a value for each voxel, which are stored in bytes, and their largest values."""
+LARGEST_SIZE = 4.0
+NUMBERS = ("surface", "cell", "garment", "printed", "box", "face", "skirt", "between")
+"""Fields of whole numbers."""
 BLACK = 0.1
 """sRGB-encoded colour of what is black: folds would not show in less."""
 DIMMEST = 0.3
@@ -37,7 +46,8 @@ EXPLAINED = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Surfaces(TensorRecord):
-    """L surfaces in N boxes, of which later ones cover earlier ones, and Q prints on M of these boxes."""
+    """L surfaces in N boxes, of which later ones cover earlier ones, Q prints on M of these boxes, F boxes of the face
+    and G of skirts."""
 
     condition: Float[Tensor, "l x"]
     """What all people who have the surface are like: 1 at their values (`AttributeVocabulary.encode`)."""
@@ -63,11 +73,27 @@ class Surfaces(TensorRecord):
     """The box's place among the N."""
     second: Float[Tensor, "m 512"]
     """How much of a voxel's colour is the second one, 0 ... 1."""
+    face: Int[Tensor, "f"]
+    """The box."""
+    features: Float[Tensor, "f 512 3"]
+    """Mean colour of the voxel."""
+    by_skin: Float[Tensor, "f 512"]
+    """How much of a change of the skin is one of the voxel: little where eyes are white and lips are red."""
+    skin: Float[Tensor, "2 3"]
+    """Mean skin, and the darkest."""
+    skirt: Int[Tensor, "g"]
+    """The surface of the people who have the skirt."""
+    between: Int[Tensor, "g"]
+    """The box between their legs."""
+    dense: Float[Tensor, "g 512"]
+    """Its density, as stored in cells."""
+    size: Float[Tensor, "g 3"]
+    """Its `delta_scale`."""
 
-    def recolour(self, cells: Float[Tensor, "b k v"], kind: Float[Tensor, "b x"]) -> Float[Tensor, "b k v"]:
+    def draw(self, cells: Float[Tensor, "b k v"], kind: Float[Tensor, "b x"]) -> Float[Tensor, "b k v"]:
         """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour, or
-        in the two of a print."""
-        recoloured = cells.clone()
+        in the two of a print, faces as even as their skin is dark, and whole skirts."""
+        drawn_cells = cells.clone()
         for person, its in enumerate(_fitting(kind, self.condition)):
             surfaces = its.nonzero()[:, 0].tolist()
             covered = cells.new_zeros(cells.shape[1], S**3)
@@ -75,7 +101,12 @@ class Surfaces(TensorRecord):
             for surface in reversed(surfaces):
                 own = self.surface == surface
                 colour = self._colour(cells[person], own & self.read, 1 - covered)
-                colours[surface] = (colour.cummin(0).values if self.natural[surface] else colour).clamp_min(BLACK)
+                if self.natural[surface]:
+                    colour = colour.cummin(0).values
+                    if (own & self.read & ~self.drawn).any():  # skin, which is read from the face
+                        colour = torch.maximum(colour, self.skin[1])
+                        drawn_cells[person, self.face, : 3 * S**3] = self._face(cells[person], colour).mT.flatten(1)
+                colours[surface] = colour.clamp_min(BLACK)
                 own &= self.drawn
                 covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
             for surface in surfaces:
@@ -84,10 +115,19 @@ class Surfaces(TensorRecord):
                 if drawn is None:
                     own = own[self.drawn[own]]
                     drawn = self.tone[own][..., None] * colours[surface]
-                rgb = voxels_of(recoloured[person, self.cell[own]])[..., :3]
+                rgb = voxels_of(drawn_cells[person, self.cell[own]])[..., :3]
                 rgb = torch.lerp(rgb, drawn, self.share[own][..., None])
-                recoloured[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
-        return recoloured
+                drawn_cells[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
+            own = its[self.skirt]
+            shape = torch.cat([self.dense[own], self.size[own] * SCALE_VALUE], dim=1)
+            drawn_cells[person, self.between[own], 3 * S**3 :] = shape
+        return drawn_cells
+
+    def _face(self, cells: Float[Tensor, "k v"], skin: Float[Tensor, "3"]) -> Float[Tensor, "f 512 3"]:
+        """The face's colours: what it has of its own is smaller on skin darker than the mean."""
+        common = self.features + self.by_skin[..., None] * (skin - self.skin[0])
+        own = voxels_of(cells[self.face])[..., :3] - common
+        return common + (skin / self.skin[0]).clamp_max(1) * own
 
     def _printed(
         self,
@@ -158,6 +198,22 @@ class Surfaces(TensorRecord):
         of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / tone.clamp_min(1e-6)
         sure = weight.sum(1) > whole.sum(1) / 2
         return of_boxes[sure] if sure.any() else of_boxes.mean(0, keepdim=True)
+
+
+def without_faces_and_skirts() -> dict[str, Tensor]:
+    """Fields of surfaces that have no faces and no skirts."""
+    none = torch.zeros(0, dtype=torch.int64)
+    voxels = torch.zeros(0, S**3)
+    return {
+        "face": none,
+        "features": voxels[..., None].expand(0, S**3, 3),
+        "by_skin": voxels,
+        "skin": torch.tensor([[1.0] * 3, [0.0] * 3]),
+        "skirt": none,
+        "between": none,
+        "dense": voxels,
+        "size": voxels[:, :3],
+    }
 
 
 def _fitting(kind: Float[Tensor, "b x"], condition: Float[Tensor, "n x"]) -> Bool[Tensor, "b n"]:

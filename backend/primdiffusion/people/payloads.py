@@ -43,6 +43,8 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import Person, make_person, recolour
+from primdiffusion.people.skirts import box_sizes
+from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
@@ -54,7 +56,7 @@ from primdiffusion.runtime.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-METHOD = "fitted 4"
+METHOD = "fitted 5"
 """Method and version stored in files, followed by the checkpoint; those of others are made again."""
 GUESS_LEVEL = 100
 """Step at which the model denoises the mesh's own colours, to make the start of a fit."""
@@ -104,7 +106,8 @@ def write_payloads(assets: Assets, path: Path, variants: int, seed: int, checkpo
     colourings = coloured_people(assets, seed, variants)
     person = colourings[0]
     meshes, frames = [variant.mesh for variant in colourings], rest_frames(person.betas)
-    payloads = fitted_payloads(meshes, frames, person.betas, _model(checkpoint))
+    sizes = box_sizes(attribute_labels(person.attributes)["outfit"])
+    payloads = fitted_payloads(meshes, frames, person.betas, _model(checkpoint), sizes)
     attributes = {**person.attributes, "variants": [variant.attributes for variant in colourings]}
     entries = {
         "voxels": np.stack([voxels_from_payload(payload) for payload in payloads]),
@@ -113,6 +116,8 @@ def write_payloads(assets: Assets, path: Path, variants: int, seed: int, checkpo
         "seed": seed,
         "making": _method(checkpoint),
     }
+    if sizes is not None:
+        entries["delta_scale"] = sizes.half().expand(variants, K, 3).numpy()
     store_payloads(path, entries)
 
 
@@ -183,14 +188,15 @@ def fitted_payloads(
     frames: Frames,
     betas: Float[ndarray, "10"],
     model: DiffusionModel | None,
+    sizes: Float[Tensor, "k 3"] | None = None,
     settings: InverseSettings = SETTINGS,
     turn: float = 0.0,
 ) -> list[Payload]:
     """Fit payloads to meshes that differ only in their textures, in the rest pose of the default body.
 
     Density and the first colouring are fitted jointly, then all colours with that density fixed. Each starts from the
-    guess of `model` (None: the mesh's own colours). `turn` (0 to 1) rotates the cameras towards their neighbours, to
-    measure how much the result depends on them.
+    guess of `model` (None: the mesh's own colours). `sizes` are the payloads' `delta_scale` (None: 1). `turn` (0 to 1)
+    rotates the cameras towards their neighbours, to measure how much the result depends on them.
 
     Takes about 30 s on one core; further colourings add little, as they share marches and matrices.
 
@@ -199,8 +205,9 @@ def fitted_payloads(
     """
     if not colourings:
         raise ValueError("no mesh to fit to: give at least one colouring")
-    field = surface_field(colourings[0], frames)
-    starts = [colour(field, mesh) for mesh in colourings]
+    sizes = torch.ones_like(frames.half_extent) if sizes is None else sizes
+    field = surface_field(colourings[0], dataclasses.replace(frames, half_extent=frames.half_extent * sizes))
+    starts = [dataclasses.replace(colour(field, mesh), delta_scale=sizes) for mesh in colourings]
     near = near_surface(starts[0])
     if model is not None:
         starts = [guess(model, start) for start in starts]

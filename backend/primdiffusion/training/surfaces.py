@@ -18,8 +18,17 @@ from torch.nn import functional
 
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.surfaces import BRIGHTEST, DIMMEST, SURELY, Surfaces, seen, voxels_of
+from primdiffusion.diffusion.surfaces import (
+    BRIGHTEST,
+    DIMMEST,
+    SURELY,
+    Surfaces,
+    seen,
+    voxels_of,
+    without_faces_and_skirts,
+)
 from primdiffusion.editing.regions import region_of
+from primdiffusion.people.skirts import box_sizes
 from primdiffusion.primitives.primitives import GRID, S
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
@@ -75,6 +84,15 @@ class _Surface(NamedTuple):
     """Whether people who have it wear a pattern there."""
 
 
+class _Skirt(NamedTuple):
+    """Boxes of an outfit's skirt, as fields of `Surfaces`."""
+
+    skirt: Int[Tensor, "g"]
+    between: Int[Tensor, "g"]
+    dense: Float[Tensor, "g 512"]
+    size: Float[Tensor, "g 3"]
+
+
 def fit_surfaces(
     people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
 ) -> Surfaces | None:
@@ -85,8 +103,12 @@ def fit_surfaces(
     """
     known = _People(people, codec, vocabulary, config)
     found: list[_Surface] = []
+    skirts: list[_Skirt] = []
     for outfit in vocabulary.categories.get(config.outfit, ()):
-        found += known.worn({config.outfit: outfit}, known.only("pattern", "plain"))
+        worn = known.worn({config.outfit: outfit}, known.only("pattern", "plain"))
+        if worn:
+            skirts += known.skirt({config.outfit: outfit}, box_sizes(outfit), len(found))
+        found += worn
     for hair in vocabulary.categories.get(config.hair, ()):
         styles = known.in_voxels({config.hair: hair}, known.only("hat", "none"), hair in config.hanging)
         found += [style._replace(natural=True) for style in styles]
@@ -97,10 +119,9 @@ def fit_surfaces(
         found += known.in_voxels({"shoes": shoes}, where=("feet", "feet", "shins"))
     if not found:
         return None
-    rows = [one.rows for one in found]
-    surface = torch.cat([torch.full((len(each.cell),), number) for number, each in enumerate(rows)])
-    cell, share, tone, read, drawn = (torch.cat(each) for each in zip(*rows, strict=True))
-    garment, printed, box, second = [], [surface[:0]], [surface[:0]], [share[:0]]
+    rows = _Rows(*(torch.cat(each) for each in zip(*(one.rows for one in found), strict=True)))
+    surface = torch.cat([torch.full((len(one.rows.cell),), number) for number, one in enumerate(found)])
+    garment, printed, box, second = [], [surface[:0]], [surface[:0]], [rows.share[:0]]
     for number, one in enumerate(found):
         boxes = (surface == number).nonzero()[:, 0]
         for found_print in known.prints(one):
@@ -108,9 +129,20 @@ def fit_surfaces(
             garment.append(number)
             box.append(boxes[found_print.box])
             second.append(found_print.second)
-    of_prints = torch.tensor(garment, dtype=torch.int64), *(torch.cat(each) for each in (printed, box, second))
-    conditions, natural = torch.stack([one.condition for one in found]), torch.tensor([one.natural for one in found])
-    return Surfaces(conditions, natural, surface, cell, share, tone, read, drawn, *of_prints)
+    fields = without_faces_and_skirts() | known.face()
+    if skirts:
+        fields |= {name: torch.cat([getattr(skirt, name) for skirt in skirts]) for name in _Skirt._fields}
+    return Surfaces(
+        condition=torch.stack([one.condition for one in found]),
+        natural=torch.tensor([one.natural for one in found]),
+        surface=surface,
+        **rows._asdict(),
+        garment=torch.tensor(garment, dtype=torch.int64),
+        printed=torch.cat(printed),
+        box=torch.cat(box),
+        second=torch.cat(second),
+        **fields,
+    )
 
 
 class _People:
@@ -127,6 +159,8 @@ class _People:
             if hair in config.hanging:
                 self.hanging |= self.condition @ vocabulary.encode({config.hair: hair}) > 0
         self.boxes = torch.cat([_mean(voxels, seen(voxels)) for voxels in self.voxels(torch.arange(count))])
+        self.skin = torch.full((count, 3), torch.nan)
+        """The colour of faces, where it is known."""
 
     def only(self, name: str, value: str) -> Mapping[str, str]:
         """The attribute, unless it is unknown."""
@@ -164,6 +198,7 @@ class _People:
         if skin is None or not (skin & face).any():
             return []
         of_skin = self.rows(own, skin, read=face, drawn=~face)
+        self.skin[own] = boxes[:, skin & face].mean(1)
         whoever, everyone = row, own
         row, own = self.with_all({**attributes, **plain}, hanging=False)
         patterned = everyone[~torch.isin(everyone, own)]
@@ -193,6 +228,31 @@ class _People:
                 if (self.condition @ condition >= condition.sum()).any():
                     found.append(_Surface(condition, rows._replace(drawn=~rows.read), patterned=True))
         return found
+
+    def face(self) -> dict[str, Tensor]:
+        """Regressions of the face's colours on the skin, as fields of `Surfaces`; none without people in outfits."""
+        own = (~self.skin.isnan().any(1)).nonzero()[:, 0]
+        if not len(own):
+            return {}
+        skin, face = self.skin[own], region_of(("face",)).nonzero()[:, 0]
+        mean = skin.mean(0)
+        features, by_skin = (torch.zeros(len(face), S**3, *size) for size in ((3,), ()))
+        for some, voxels in zip((skin - mean).split(CHUNK), self.voxels(own), strict=True):
+            colours = voxels[:, face, :, :3]
+            features += colours.sum(0) / len(own)
+            by_skin += torch.einsum("nc,nkvc->kv", some, colours)
+        by_skin = (by_skin / (skin - mean).square().sum().clamp_min(1e-6)).clamp(0, BRIGHTEST)
+        skins = torch.stack([mean, skin[skin.mean(1).argmin()]])
+        return {"face": face, "features": features.clamp(0, 1), "by_skin": by_skin, "skin": skins}
+
+    def skirt(self, attributes: Mapping[str, str], sizes: Float[Tensor, "k 3"] | None, surface: int) -> list[_Skirt]:
+        """The mean density of the boxes that are sized for the outfit's skirt; none without people or a skirt."""
+        _, own = self.with_all(attributes)
+        if sizes is None or not len(own):
+            return []
+        between = (sizes != 1).any(1).nonzero()[:, 0]
+        dense = sum(voxels[:, between, :, 3].sum(0) for voxels in self.voxels(own)) / len(own)
+        return [_Skirt(torch.full_like(between, surface), between, dense.clamp(0, 1), sizes[between])]
 
     def even(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> bool:
         """Whether it has one colour on these people."""

@@ -243,7 +243,7 @@ def test_payloads_are_stored_whole_and_mended(assets, tmp_path, monkeypatch):
     monkeypatch.setattr(payloads_module, "fit_payload", lambda start, *_: start)
     monkeypatch.setattr(payloads_module, "fit_colours", with_density)
     monkeypatch.setattr(payloads_module, "_targets", lambda *_: [[]])
-    reports, method = [], f"fitted 4 from {load_checkpoint().card['sha256'][:12]}"
+    reports, method = [], f"{payloads_module.METHOD} from {load_checkpoint().card['sha256'][:12]}"
     (path,) = make_payloads(assets, tmp_path, 1, 2, 3, 1, report=lambda done, total: reports.append((done, total)))
     assert reports == [(0, 1), (1, 1)]
     with np.load(path, allow_pickle=False) as file:
@@ -294,7 +294,7 @@ def test_fits_look_more_like_the_mesh_from_sides_not_shown_and_from_a_guess_leav
         return float((z - model.encode(payloads_module.guess(model, payload))).square().mean().sqrt())
 
     brief = InverseSettings(steps=1, iterations=4, colour_iterations=6, pull=1.0, smoothness=0.3)
-    found = [fitted_payloads(colourings, frames, people[0].betas, start, brief) for start in (None, model)]
+    found = [fitted_payloads(colourings, frames, people[0].betas, start, settings=brief) for start in (None, model)]
     for payloads in found:
         assert torch.equal(payloads[0].density, payloads[1].density)
         near = payloads_module.near_surface(from_mesh(colourings[0], frames))
