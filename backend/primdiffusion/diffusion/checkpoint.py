@@ -362,20 +362,27 @@ BYTE = 255.0
 
 
 def store_surfaces(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Surfaces with values of voxels in bytes."""
+    """Surfaces with values of voxels in bytes, and shares of boxes that are not whole."""
     in_bytes = {f"surfaces.{name}": tensors[f"surfaces.{name}"] / most for name, most in LARGEST.items()}
-    return tensors | {key: (value * BYTE).round().to(torch.uint8) for key, value in in_bytes.items()}
+    stored = tensors | {key: (value * BYTE).round().to(torch.uint8) for key, value in in_bytes.items()}
+    whole = (stored["surfaces.share"] == BYTE).all(1)
+    return stored | {"surfaces.whole": whole, "surfaces.share": stored["surfaces.share"][~whole]}
 
 
 def restore_surfaces(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabulary) -> Surfaces | None:
     """Undo `store_surfaces`; None without any. Raises ValueError, KeyError and TypeError where tensors do not fit."""
     if not tensors:
         return None
-    tensors = {**without_faces_and_skirts(), **tensors}  # earlier checkpoints have neither
-    whole = {name: tensors[name].long() for name in NUMBERS}
+    tensors = {**without_faces_and_skirts(), **tensors}  # earlier checkpoints have neither, and store all shares
+    whole = tensors.pop("whole", torch.zeros(len(tensors["cell"]))).bool()
+    numbers = {name: tensors[name].long() for name in NUMBERS}
     flags = {name: tensors[name].bool() for name in ("natural", "read", "drawn")}
     of_voxels = {name: tensors[name].float() / BYTE * most for name, most in LARGEST.items()}
-    surfaces = Surfaces(**{**tensors, **whole, **flags, **of_voxels})
+    partial, of_voxels["share"] = of_voxels["share"], torch.ones_like(of_voxels["tone"])
+    if whole.shape != of_voxels["tone"].shape[:1] or partial.shape != of_voxels["tone"][~whole].shape:
+        raise ValueError(f"share has shape {tuple(partial.shape)}, which does not fit the boxes that are not whole")
+    of_voxels["share"][~whole] = partial
+    surfaces = Surfaces(**{**tensors, **numbers, **flags, **of_voxels})
     check_surfaces(surfaces, vocabulary)
     return surfaces
 

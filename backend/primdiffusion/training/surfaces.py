@@ -29,7 +29,7 @@ from primdiffusion.diffusion.surfaces import (
 )
 from primdiffusion.editing.regions import region_of
 from primdiffusion.people.skirts import box_sizes
-from primdiffusion.primitives.primitives import GRID, S
+from primdiffusion.primitives.primitives import GRID, K, S
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.prints import FEWEST_GEOMETRIES, Print, find_prints
@@ -52,12 +52,18 @@ UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
 UNEVEN_GARMENT = 0.0136
 """The same in the median over a garment's boxes: more are prints and fades, which plain garments may have too."""
+SMALL, UNEVEN_SMALL = 80, 0.03
+"""Boxes of a garment without fades, of which others leave little, and the same of it: a shirt below a jacket."""
 UNEVEN_BORDER = 0.12
 """The same of voxels where surfaces meet, in boxes that are wholly explained by them."""
 UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
 LEAST_SHARE = 0.05
 """Of a voxel: less is chance."""
+NO_CLOTH, ALL_CLOTH = 0.1, 0.43
+"""Shares of a garment between the legs, below which there is none, and above which it hides all else."""
+DENSE = 0.9
+"""Quantile of people whose cloth between the legs is less dense."""
 SURROUNDED = 0.7
 """Share of a box and its neighbours that a garment covers, above which the box is the garment's too."""
 FEWEST_BOXES = 24
@@ -105,9 +111,11 @@ def fit_surfaces(
     found: list[_Surface] = []
     skirts: list[_Skirt] = []
     for outfit in vocabulary.categories.get(config.outfit, ()):
-        worn = known.worn({config.outfit: outfit}, known.only("pattern", "plain"))
-        if worn:
-            skirts += known.skirt({config.outfit: outfit}, box_sizes(outfit), len(found))
+        sizes = box_sizes(outfit)
+        between = (torch.ones(K, 3) if sizes is None else sizes).ne(1).any(1)
+        worn = known.worn({config.outfit: outfit}, known.only("pattern", "plain"), between)
+        if worn and sizes is not None:
+            skirts.append(known.skirt({config.outfit: outfit}, sizes, len(found)))
         found += worn
     for hair in vocabulary.categories.get(config.hair, ()):
         styles = known.in_voxels({config.hair: hair}, known.only("hat", "none"), hair in config.hanging)
@@ -187,8 +195,11 @@ class _People:
         few = len(self.geometry[own].unique()) < FEWEST_GEOMETRIES
         return (own & (not few)).nonzero()[:, 0]
 
-    def worn(self, attributes: Mapping[str, str], plain: Mapping[str, str]) -> list[_Surface]:
-        """Skin and plain garments of an outfit, in the boxes that they cover and in the voxels where they meet."""
+    def worn(
+        self, attributes: Mapping[str, str], plain: Mapping[str, str], between: Bool[Tensor, "k"]
+    ) -> list[_Surface]:
+        """Skin and plain garments of an outfit, in the boxes that they cover and in the voxels where they meet, and in
+        all boxes `between` the legs."""
         row, own = self.with_all(attributes, hanging=False)
         boxes, face = self.boxes[own], region_of(("face",))
         if not len(own):
@@ -197,6 +208,7 @@ class _People:
         skin = _covered(boxes, region_of(("hands",)), beside, ~region_of(("hair",)))
         if skin is None or not (skin & face).any():
             return []
+        skin &= ~between  # in fits of a skirt, the insides of the legs are hidden
         of_skin = self.rows(own, skin, read=face, drawn=~face)
         self.skin[own] = boxes[:, skin & face].mean(1)
         whoever, everyone = row, own
@@ -214,7 +226,7 @@ class _People:
             return [_Surface(whoever, of_skin, natural=True)]
         meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
         everywhere, found = torch.ones_like(skin), []
-        for part, border in zip(parts, self.borders(own, parts, meet), strict=True):
+        for part, border in zip(parts, self.borders(own, parts, meet, between), strict=True):
             bare = part is parts[0]
             whole = of_skin if bare else self.rows(own, part, read=everywhere, drawn=everywhere)
             rows = _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))
@@ -245,18 +257,18 @@ class _People:
         skins = torch.stack([mean, skin[skin.mean(1).argmin()]])
         return {"face": face, "features": features.clamp(0, 1), "by_skin": by_skin, "skin": skins}
 
-    def skirt(self, attributes: Mapping[str, str], sizes: Float[Tensor, "k 3"] | None, surface: int) -> list[_Skirt]:
-        """The mean density of the boxes that are sized for the outfit's skirt; none without people or a skirt."""
+    def skirt(self, attributes: Mapping[str, str], sizes: Float[Tensor, "k 3"], surface: int) -> _Skirt:
+        """The boxes that are sized for the outfit's skirt, as dense as on most people: its cloth is at other places on
+        each."""
         _, own = self.with_all(attributes)
-        if sizes is None or not len(own):
-            return []
         between = (sizes != 1).any(1).nonzero()[:, 0]
-        dense = sum(voxels[:, between, :, 3].sum(0) for voxels in self.voxels(own)) / len(own)
-        return [_Skirt(torch.full_like(between, surface), between, dense.clamp(0, 1), sizes[between])]
+        dense = torch.cat([voxels[:, between, :, 3].clamp(0, 1) for voxels in self.voxels(own)]).quantile(DENSE, dim=0)
+        return _Skirt(torch.full_like(between, surface), between, dense, sizes[between])
 
     def even(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> bool:
         """Whether it has one colour on these people."""
-        return bool(_tones(self.boxes[people], garment)[1][garment].median() < UNEVEN_GARMENT)
+        most = UNEVEN_SMALL if garment.sum() < SMALL else UNEVEN_GARMENT
+        return bool(_tones(self.boxes[people], garment)[1][garment].median() < most)
 
     def prints(self, garment: _Surface) -> list[Print]:
         """Prints on a garment of patterned people."""
@@ -281,9 +293,14 @@ class _People:
         return _Rows(part.nonzero()[:, 0], torch.ones_like(tones), tones, read[part], drawn[part])
 
     def borders(
-        self, own: Int[Tensor, "n"], parts: Sequence[Bool[Tensor, "k"]], meet: Bool[Tensor, "k"]
+        self,
+        own: Int[Tensor, "n"],
+        parts: Sequence[Bool[Tensor, "k"]],
+        meet: Bool[Tensor, "k"],
+        always: Bool[Tensor, "k"],
     ) -> Iterator[_Rows]:
-        """Voxels of each of these surfaces in the boxes where some meet, if they explain the box on other people too.
+        """Voxels of each of these surfaces in the boxes where some meet, if they explain the box on other people too,
+        or in any case.
 
         A surface is drawn over those before it, so its share is that of what later ones leave.
         """
@@ -299,11 +316,14 @@ class _People:
         parts_of, tone = both.fitted()
         weight = both.seen / both.seen.sum(1, keepdim=True).clamp_min(1e-6)
         explained &= (parts_of * weight[..., None]).sum(1).amax(1) < COVERED
+        explained |= always[cells]
         above = torch.zeros(len(cells), S**3)
         borders = []
         for of_part in reversed(parts_of.unbind(-1)):
             share = (of_part / (1 - above).clamp_min(1e-6)).clamp(0, 1)
             above += of_part
+            cloth = ((share - NO_CLOTH) / (ALL_CLOTH - NO_CLOTH)).clamp(0, 1)
+            share = torch.where(always[cells][:, None], cloth, share)
             kept = explained & (of_part > LEAST_SHARE).any(1)
             rows = share[kept], tone[kept], torch.zeros_like(kept)[kept], torch.ones_like(kept)[kept]
             borders.append(_Rows(cells[kept], *rows))

@@ -435,7 +435,8 @@ def test_decoding_recolours_people_who_have_the_surface():
 def test_surfaces_are_stored_in_bytes(tmp_path):
     model, surfaces = model_with_surfaces()
     face = {"face": torch.arange(2), "features": torch.rand(2, S**3, 3), "by_skin": BRIGHTEST * torch.rand(2, S**3)}
-    surfaces = dataclasses.replace(surfaces, **face, **skirt_of(dense=0.3, size=1.7))
+    share = surfaces.share.index_fill(0, torch.tensor([1, 3]), 1.0)
+    surfaces = dataclasses.replace(surfaces, share=share, **face, **skirt_of(dense=0.3, size=1.7))
     save_checkpoint(tmp_path / "model.safetensors", dataclasses.replace(model, surfaces=surfaces), "linear")
     loaded = load_checkpoint(tmp_path / "model.safetensors").surfaces
     assert loaded is not None
@@ -448,11 +449,14 @@ def test_earlier_checkpoints_have_neither_faces_nor_skirts():
     model, surfaces = model_with_surfaces()
     tensors = store_surfaces({f"surfaces.{name}": value for name, value in vars(surfaces).items()})
     earlier = {name.removeprefix("surfaces."): value for name, value in tensors.items()}
-    for name in without_faces_and_skirts():
+    for name in ("whole", *without_faces_and_skirts()):
         del earlier[name]
     loaded = restore_surfaces(earlier, model.vocabulary)
     assert loaded is not None
     assert not len(loaded.face) + len(loaded.skirt)
+    for damage in ({"whole": torch.ones(4)}, {"whole": torch.ones(5)}, {"share": torch.zeros(5, 3)}):
+        with refused(ValueError, "share"):
+            restore_surfaces({**earlier, **damage}, model.vocabulary)
 
 
 @pytest.mark.parametrize(
