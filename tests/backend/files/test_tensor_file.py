@@ -137,7 +137,7 @@ def test_writing_to_what_was_loaded_leaves_the_file_as_it_is(tmp_path):
         b"Phello\n.",
         b"\x82\x01.",
         b"\x80\x09N.",
-        b"b.", b"0.", b"t.", b"R.", b"h\x05.", b"N", b"", b"NNR.",
+        b"b.", b"0.", b"t.", b"R.", b"h\x05.", b"N", b"", b"NNR.", b"X\x01", b"\x80\x04\x95\x01",
     ],
 )  # fmt: skip
 def test_hostile_pickles_end_at_once_within_little_memory(data):
@@ -148,7 +148,7 @@ def test_hostile_pickles_end_at_once_within_little_memory(data):
     assert tracemalloc.get_traced_memory()[1] < 2**26
     tracemalloc.stop()
     assert time.process_time() - began < 10
-    assert len(str(raised.value)) < 150
+    assert len(str(raised.value)) < 200
 
 
 @pytest.mark.parametrize("protocol", range(6))
@@ -187,7 +187,7 @@ def test_a_state_changes_neither_classes_nor_what_an_object_is(data):
     except FileError:
         pass
     else:
-        assert type(found) is smpl_pickle.Inert
+        assert isinstance(found, smpl_pickle.Stored)
     assert before == {kind: dict(vars(kind)) for kind in before}
 
 
