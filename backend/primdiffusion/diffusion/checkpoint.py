@@ -67,7 +67,7 @@ class ModelConfig(Open):
     """Denoiser: a PersonDenoiser, a SlabUNet, or the authors' U-Net on a body of the user."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"]
     """Noise schedule."""
-    chain: Literal["trailing", "early", "released"] = "trailing"
+    chain: Literal["trailing", "early", "released"]
     """Timesteps of samplers."""
     full_density: Annotated[float, Range(1e-30, LARGEST_NUMBER)]
     """Density of a stored value of 1, 1/m."""
@@ -84,10 +84,7 @@ class ModelConfig(Open):
 
     def unet(self) -> UNetConfig:
         """Return the sizes of a U-Net. Raises FieldError."""
-        config = dict(self.config)
-        if config.get("attention_context") == "tokens":  # earlier files name the only choice that is left
-            del config["attention_context"]
-        return read(UNetConfig, config)
+        return read(UNetConfig, self.config)
 
 
 def default_checkpoint() -> Path:
@@ -169,14 +166,8 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], ModelConfig, dict[st
     """
     tensors, metadata, digest = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
-        architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
-        if "detail" in architecture or architecture.get("config", {}).get("person"):
-            raise FileError(
-                path,
-                "has a second network, which this version no longer reads",
-                "train a new checkpoint, or use the default one",
-            )
-        return tensors, read(ModelConfig, architecture), {**card, "sha256": digest}
+        card = {**parse_json(metadata["card"]), "sha256": digest}
+        return tensors, read(ModelConfig, parse_json(metadata["architecture"])), card
 
 
 def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str], str]:
