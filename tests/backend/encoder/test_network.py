@@ -62,9 +62,9 @@ def differs(a: Payload, b: Payload) -> bool:
     return any((x - y).abs().max() > 1e-6 for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
 
 
-@pytest.mark.parametrize("preset", ARCHITECTURES)
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_gives_a_payload(preset):
-    config = ARCHITECTURES[preset]
+    config = PRESETS[preset]
     torch.manual_seed(0)
     with torch.no_grad():
         payload = Encoder(config)(seen_from(config), poses())
