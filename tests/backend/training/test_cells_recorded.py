@@ -20,7 +20,7 @@ from support.runs import same_tensors
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-STEPS = 8
+STEPS = 4
 
 
 @pytest.fixture(scope="module")
