@@ -102,18 +102,6 @@ def test_all_boxes_lie_within_the_depth_span_and_touch_its_ends(boxes, camera):
     assert depth_span(boxes, camera, (0.55, 0.6)) == (0.55, 0.6)
 
 
-def test_before_a_person_a_solid_is_all_there_is_and_behind_it_is_what_is_left(boxes, camera):
-    before = draw(Scene(boxes, wall(0.4)), camera)
-    assert np.array_equal(before.rgba, draw(Scene(None, wall(0.4)), camera).rgba)
-    people, behind = draw(Scene(boxes), camera), draw(Scene(boxes, wall(-0.4)), camera)
-    solid = draw(Scene(None, wall(-0.4)), camera)
-    alpha = people.rgba[..., 3:]
-    assert np.allclose(behind.rgba, people.rgba + (1 - alpha) * solid.rgba, atol=1e-6)
-    hit = people.depth < NOTHING
-    assert np.array_equal(behind.depth[hit], people.depth[hit])
-    assert np.allclose(behind.depth[~hit], solid.depth[~hit])
-
-
 def test_a_solids_outline_is_smooth_and_where_it_is_nearer_it_hides_people(boxes, camera):
     """A wall whose edge crosses the picture at a slant, before the people and behind them."""
     for z in (0.3, -0.3):

@@ -94,11 +94,6 @@ def test_without_pixels_nothing_is_drawn(tmp_path):
         assert picture(SamplerStep(0, 2, 500, torch.zeros(1), torch.zeros(1))) is None
 
 
-def test_the_last_step_has_no_picture_for_the_result_follows(tmp_path, always):
-    with step_previews(tmp_path, 16, pytest.fail) as picture:
-        assert picture(SamplerStep(1, 2, 500, torch.zeros(1), torch.zeros(1))) is None
-
-
 def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_behind(checkpoint, tmp_path, always):
     plain, shown = tmp_path / "plain", tmp_path / "shown"
     same = {"seed": 5, "steps": 4, "checkpoint": checkpoint, "size": 32}
