@@ -123,8 +123,8 @@ def stored_voxels(
 
 def front(primitives: Primitives) -> Tensor:
     """An sRGB picture from the front over white, 299 x 299, as networks for photographs take it."""
-    view = march(primitives, camera_of(PORTRAITS[0], 299), background=(1.0, 1.0, 1.0))
-    return encode_srgb(view.rgb.clamp(0, 1))
+    view = march(primitives, camera_of(PORTRAITS[0], 299))
+    return encode_srgb(view.over((1.0, 1.0, 1.0)).clamp(0, 1))
 
 
 def seeds_of(count: int, first: int = 0) -> list[int]:

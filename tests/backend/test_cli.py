@@ -226,12 +226,6 @@ def test_an_interrupt_is_130_without_a_traceback_and_leaves_nothing(monkeypatch,
     assert not (tmp_path / "out").exists()
 
 
-def test_training_has_parameters_of_its_own(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["train", "--help"])
-    assert "--data" in capsys.readouterr().out
-
-
 def test_help_does_not_load_torch():
     code = """
 import contextlib, sys

@@ -94,34 +94,12 @@ def test_clip_planes_are_at_depths_and_not_at_distances(boxes, camera):
     assert np.abs(distances.alpha - want.alpha).max() > 0.1, "the test can tell them apart"
 
 
-def test_planes_that_cut_nothing_change_nothing(boxes, camera):
-    near, far = depth_span(boxes, camera, (0, math.inf))
-    free = draw(Scene(boxes), camera, ViewSettings())
-    loose = draw(Scene(boxes), camera, ViewSettings(clip=(near - 1e-4, far + 1e-4)))
-    behind_all = draw(Scene(boxes, wall(-50.0)), camera, ViewSettings(clip=(0.1, 10)))
-    for other in (loose, behind_all):
-        assert np.allclose(other.rgba, free.rgba, atol=1e-6)
-        assert np.array_equal(other.depth, free.depth)
-
-
 def test_all_boxes_lie_within_the_depth_span_and_touch_its_ends(boxes, camera):
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     corners = boxes.position[:, None] + (boxes.half_extent[:, None] * signs) @ boxes.rotation.mT
     _, depth = camera.project(corners.reshape(-1, 3))
     assert depth_span(boxes, camera, (0, math.inf)) == pytest.approx((float(depth.min()), float(depth.max())))
     assert depth_span(boxes, camera, (0.55, 0.6)) == (0.55, 0.6)
-
-
-def test_before_a_person_a_solid_is_all_there_is_and_behind_it_is_what_is_left(boxes, camera):
-    before = draw(Scene(boxes, wall(0.4)), camera)
-    assert np.array_equal(before.rgba, draw(Scene(None, wall(0.4)), camera).rgba)
-    people, behind = draw(Scene(boxes), camera), draw(Scene(boxes, wall(-0.4)), camera)
-    solid = draw(Scene(None, wall(-0.4)), camera)
-    alpha = people.rgba[..., 3:]
-    assert np.allclose(behind.rgba, people.rgba + (1 - alpha) * solid.rgba, atol=1e-6)
-    hit = people.depth < NOTHING
-    assert np.array_equal(behind.depth[hit], people.depth[hit])
-    assert np.allclose(behind.depth[~hit], solid.depth[~hit])
 
 
 def test_a_solids_outline_is_smooth_and_where_it_is_nearer_it_hides_people(boxes, camera):
@@ -214,8 +192,10 @@ def test_the_view_boxes_shows_boxes_before_solids(boxes, camera):
     assert np.array_equal(through.depth, np.minimum(np.where(seen, drawn.depth, np.inf), wall_depth))
 
 
-@pytest.mark.parametrize("view", ["colour", "depth", "alpha", "boxes"])
-@pytest.mark.parametrize("speed", [None, 1.0, 2000.0, 1e9])
+@pytest.mark.parametrize(
+    ("view", "speed"),
+    [("colour", None), ("colour", 1.0), ("depth", 1e9), ("depth", 2000.0), ("alpha", 2000.0), ("boxes", 2000.0)],
+)
 def test_bands_make_the_picture(boxes, camera, view, speed):
     scene, look = Scene(boxes, wall(0.0, 0.4)), ViewSettings(view, BACKGROUND, (0.1, 10))
     whole, picture = draw(scene, camera, look), Image.blank(camera.width, camera.height)

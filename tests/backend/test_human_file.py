@@ -71,13 +71,6 @@ def test_a_compact_file_with_a_single_colour_is_rejected(human, tmp_path):
         load_human(path)
 
 
-def test_a_person_with_nan_is_not_written(human, tmp_path):
-    broken = dataclasses.replace(human, betas=torch.full((10,), float("nan")))
-    with refused(ValueError, "betas"):
-        save_human(tmp_path / "file", broken)
-    assert list(tmp_path.iterdir()) == []
-
-
 META = {"format": "primdiffusion.human", "format_version": "1", "provenance": "{}"}
 
 
@@ -101,25 +94,6 @@ def stored(human, tmp_path_factory) -> dict[str, torch.Tensor]:
     path = tmp_path_factory.mktemp("stored") / "a.human.safetensors"
     save_human(path, human)
     return safetensors.torch.load_file(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("density", lambda values: None, "density is missing"),
-        ("rgb", lambda values: values[..., :4].contiguous(), "rgb is torch.float32"),
-        ("betas", lambda values: values.to(torch.int64), "betas is torch.int64"),
-        ("density", lambda values: values / 0, "'density' holds NaN"),
-        ("betas", lambda values: torch.full((10,), 6.0), "largest beta is 6"),
-        ("rgb", lambda values: values.to(torch.float8_e4m3fn), "'rgb' is torch.float8_e4m3fn"),
-    ],
-    ids=["missing", "wrong shape", "whole numbers", "NaN", "giant", "8 bits"],
-)
-def test_a_damaged_file_is_rejected_by_name_with_its_damage(stored, tmp_path, name, change, message):
-    path = tmp_path / "bad.human.safetensors"
-    tensors = {**stored, name: change(stored[name])}
-    written(path, {name: values for name, values in tensors.items() if values is not None})
-    assert message in rejected(path)
 
 
 def body_named(path: str | int) -> str:
@@ -158,12 +132,6 @@ def test_metadata_that_are_none_of_a_human_are_rejected_by_their_entry(stored, t
     assert message in rejected(path)
 
 
-def test_a_newer_file_is_rejected_for_its_version_even_where_its_tensors_are_others(tmp_path):
-    path = tmp_path / "newer.human.safetensors"
-    written(path, {"latents": torch.zeros(3)}, format_version="4")
-    assert "format 4" in rejected(path)
-
-
 def test_a_file_of_the_first_release_is_read(stored, tmp_path):
     """Written before people had attributes, hashes and edits."""
     path = tmp_path / "old.human.safetensors"
@@ -181,7 +149,11 @@ def test_unknown_entries_of_the_provenance_are_saved(human, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"betas": torch.full((10,), -5.5)}, "beta"), ({"provenance": {"edits": "many"}}, "edits")],
+    [
+        ({"betas": torch.full((10,), -5.5)}, "beta"),
+        ({"betas": torch.full((10,), float("nan"))}, "betas"),
+        ({"provenance": {"edits": "many"}}, "edits"),
+    ],
 )
 def test_what_could_not_be_read_again_is_not_written(human, tmp_path, change, message):
     with refused(ValueError, message):

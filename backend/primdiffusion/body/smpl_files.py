@@ -29,16 +29,13 @@ _ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
 """Encodings of "no parent": -1, or -1 converted to an unsigned integer."""
 
 
-def load_body(
-    path: str | Path, uv: str | Path | tuple[Path, Path], shape_components: int = SHAPE_COMPONENTS
-) -> BodyModel:
-    """Load a body (float32) from an SMPL .pkl or .npz.
+def load_body(path: str | Path, uv: str | Path | tuple[Path, Path]) -> BodyModel:
+    """Load a body (float32) from an SMPL .pkl or .npz, with the first ten of its 10 to 300 shape components.
 
     Args:
         path: the body model. Pickles are read by `smpl_pickle` and cannot run code.
         uv: texture coordinates: an .obj with the body's vertex indices, an .npz with vt [T, 2] and ft [F, 3], or
             the pair (vt.npy, ft.npy).
-        shape_components: maximum number of leading shape components to load; files hold 10 to 300.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -53,7 +50,7 @@ def load_body(
     if np.abs(template).max() > LARGEST_BODY_M:
         raise arrays.wrong("v_template", f"has vertices more than {LARGEST_BODY_M:g} m away")
     faces = arrays.whole("f", ("F", 3), vertex_count)
-    shape_basis = arrays.real("shapedirs", (vertex_count, 3, "N"))[..., :shape_components]
+    shape_basis = arrays.real("shapedirs", (vertex_count, 3, "N"))[..., :SHAPE_COMPONENTS]
     pose_basis = arrays.real("posedirs", (vertex_count, 3, POSE_FEATURES))
     skin_weights = arrays.real("weights", (vertex_count, J))
     if skin_weights.min() < -1e-4 or np.abs(skin_weights.sum(1) - 1).max() > 1e-2:

@@ -65,7 +65,7 @@ def import_released(command: ImportReleasedCommand, session: Session, report: Re
     with contextlib.ExitStack() as all_or_none:
         if inventory.unet is not None:
             out = all_or_none.enter_context(atomic_replace(command.out))
-            write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, command.chain, card)
+            write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, card)
         write_encoder(
             all_or_none.enter_context(atomic_replace(encoder_out)), encoder, body_setup, reference, encoder_card
         )

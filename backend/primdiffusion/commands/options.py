@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from primdiffusion.formats.requests import (
     VOXEL,
@@ -166,8 +166,6 @@ class ImportReleasedCommand:
     reference: Path | None = None
     """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame determined the box sizes; the
     default is the mean body in the T pose, which differs by millimetres."""
-    chain: Literal["released", "trailing"] = "released"
-    """Timesteps of samplers: 991, 981, ... 1 as in the released code, or from the last step of the schedule."""
 
 
 OPTIONS: dict[str, type] = {

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -36,7 +35,7 @@ from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.files import tensor_file
 from primdiffusion.files.arrays import LARGEST_NUMBER
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.regular_files import FileError, as_file_error, open_regular, read_regular
+from primdiffusion.files.regular_files import FileError, as_file_error, open_regular
 from primdiffusion.files.tensor_file import under
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.formats.schema import Open, Range, read
@@ -55,8 +54,7 @@ _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
 _HALVED = ("codec.mean", "codec.basis", "denoiser.")
 _WHOLE = ("prior_variance", "prior_head_variance", "prior_log_weight")
 WEIGHTS = "model.safetensors"
-"""The checkpoint in a folder of `save_pretrained` or of the Hugging Face hub."""
-_COMMIT = re.compile(r"[0-9a-zA-Z_-]{1,64}", re.ASCII)
+"""The checkpoint in a folder of `save_pretrained` or of `hf download`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,7 +65,7 @@ class ModelConfig(Open):
     """Denoiser: a PersonDenoiser, a SlabUNet, or the authors' U-Net on a body of the user."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"]
     """Noise schedule."""
-    chain: Literal["trailing", "early", "released"] = "trailing"
+    chain: Literal["trailing", "early", "released"]
     """Timesteps of samplers."""
     full_density: Annotated[float, Range(1e-30, LARGEST_NUMBER)]
     """Density of a stored value of 1, 1/m."""
@@ -84,10 +82,7 @@ class ModelConfig(Open):
 
     def unet(self) -> UNetConfig:
         """Return the sizes of a U-Net. Raises FieldError."""
-        config = dict(self.config)
-        if config.get("attention_context") == "tokens":  # earlier files name the only choice that is left
-            del config["attention_context"]
-        return read(UNetConfig, config)
+        return read(UNetConfig, self.config)
 
 
 def default_checkpoint() -> Path:
@@ -98,34 +93,15 @@ def default_checkpoint() -> Path:
 def checkpoint_file(path: Path | str | None = None) -> Path:
     """Find the checkpoint that a path stands for: a file, or the one in a folder; None: the default checkpoint.
 
-    Folders are those of `save_pretrained`, and repositories in a local hub cache (`models--OWNER--NAME`), of which the
-    commit of the main branch counts, or else the only snapshot. Nothing is downloaded. Raises FileError for a folder
-    without a model, or with several snapshots and no main branch; OSError.
+    Folders are those of `save_pretrained` and those that `hf download` prints. Nothing is downloaded. Raises FileError
+    for a folder without a model.
     """
     if path is None:
         return default_checkpoint()
-    folder = Path(path)
-    if not folder.is_dir():
-        return folder
-    if (folder / WEIGHTS).is_file():
-        return folder / WEIGHTS
-    main = folder / "refs" / "main"
-    if main.is_file():
-        commit = read_regular(main, 1024).decode("ascii", errors="replace").strip()
-        found = [folder / "snapshots" / commit / WEIGHTS] if _COMMIT.fullmatch(commit) else []
-    else:
-        found = sorted((folder / "snapshots").glob(f"*/{WEIGHTS}"))
-    found = [path for path in found if path.is_file()]
-    if len(found) > 1:
-        names = ", ".join(path.parent.name for path in found)
-        raise FileError(folder, f"holds several snapshots ({names})", "give the folder of one of them")
-    if not found:
-        raise FileError(
-            folder,
-            f"holds no {WEIGHTS}, nor a hub snapshot with one",
-            "give a folder of save_pretrained or hf download",
-        )
-    return found[0]
+    path = Path(path)
+    if path.is_dir() and not (path / WEIGHTS).is_file():
+        raise FileError(path, f"holds no {WEIGHTS}", "give a folder of save_pretrained, or the one hf download prints")
+    return path / WEIGHTS if path.is_dir() else path
 
 
 def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
@@ -169,14 +145,8 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], ModelConfig, dict[st
     """
     tensors, metadata, digest = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
-        architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
-        if "detail" in architecture or architecture.get("config", {}).get("person"):
-            raise FileError(
-                path,
-                "has a second network, which this version no longer reads",
-                "train a new checkpoint, or use the default one",
-            )
-        return tensors, read(ModelConfig, architecture), {**card, "sha256": digest}
+        card = {**parse_json(metadata["card"]), "sha256": digest}
+        return tensors, read(ModelConfig, parse_json(metadata["architecture"])), card
 
 
 def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str], str]:

@@ -1,10 +1,9 @@
 """Read the pickles in which SMPL and its poses are distributed, joblib's too, without executing code from them.
 
-A pickle is a program that may call any importable function. This reader maps every allowed global to one of the inert
-records below, which only store their arguments, and rejects all others. `as_array` rebuilds arrays afterwards, so not
-even numpy or scipy interprets the file's instructions. Operations that would take memory or C stack out of proportion
-to the file are rejected. Reads files written by Python 2 (latin1 strings), chumpy, joblib, and old and new versions of
-numpy and scipy; chumpy and joblib need not be installed.
+A pickle is a program that may call any importable function. Here every allowed global is a `Stored`, which keeps its
+arguments and its state, and all others are rejected; `as_array` makes arrays of them afterwards. Operations that would
+take memory or C stack out of proportion to the file are rejected too. Reads files of Python 2 (latin1 strings), chumpy,
+joblib, and old and new versions of numpy and scipy; chumpy and joblib need not be installed.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import io
 import math
 import pickle
 import re
+import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .regular_files import FileError, read_regular
+from .regular_files import FileError, as_file_error, read_regular
 
 MOST_OPERATIONS, BYTES_AN_OPERATION = 300_000, 8
 """Operations of a small file, and bytes for each of a larger one; SMPL's have a few thousand."""
@@ -31,22 +31,19 @@ MOST_NUMBERS = 10_000_000
 MOST_LISTED = 2_000_000
 """Numbers in lists, each of which is visited; SMPL's arrays are not lists."""
 MAX_NESTING = 8
-"""Limit on nested chumpy selections; body models nest less."""
-_DAMAGED = (
-    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError, zlib.error,
-)  # fmt: skip
-"""Exceptions of the unpickler where operations do not fit their values."""
+"""Limit on lists in lists, and on nested chumpy selections; body models nest less."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
 _TYPE_SIZE = re.compile(r"[biufcSU](\d{1,6})")
 
 
-class Inert:
+class Stored:
     """Constructor arguments and state of a pickled object."""
 
-    arguments: tuple[object, ...]
-    state: object
+    kind = ""
+    arguments: tuple[Any, ...]
+    state: Any
 
-    def __new__(cls, *arguments: object) -> Inert:
+    def __new__(cls, *arguments: object) -> Stored:
         """Store the arguments: the operations of a pickle call __new__ or the class."""
         self = object.__new__(cls)
         self.arguments, self.state = arguments, None
@@ -57,87 +54,58 @@ class Inert:
         self.state = state
 
 
-class _Array(Inert):
-    """numpy's array: state (version, shape, dtype, column-major, raw bytes)."""
+class _Reconstructed(Stored):
+    """copyreg's object constructor of protocols 0 and 1: arguments (class, base, base state)."""
+
+    def __new__(cls, kind: object, *_: object) -> Stored:
+        if not (isinstance(kind, type) and issubclass(kind, Stored)):
+            raise ValueError(f"it rebuilds a {type(kind).__name__}, which is not an array")
+        return kind()
 
 
-class _BufferArray(Inert):
-    """numpy's array in protocol 5: arguments (raw bytes, dtype, shape, order)."""
-
-
-class _Scalar(Inert):
-    """numpy's scalar: arguments (dtype, raw bytes)."""
-
-
-class _NumberType(Inert):
-    """numpy's dtype: argument 0 such as "f8", state 1 the byte order."""
-
-
-class _Latin1Bytes(Inert):
-    """Bytes written as text by protocol 2: arguments (text, "latin1")."""
-
-
-class _JoblibArray(Inert):
+class _JoblibArray(Stored):
     """joblib's array: state with shape, order, dtype; the bytes follow in the file itself, after a padding."""
 
+    kind = "joblib array"
     stream: io.BytesIO
     raw: bytes
 
     def __setstate__(self, state: object) -> None:
         """Store the state, and the bytes behind it."""
         match state:
-            case {"shape": tuple() as shape, "dtype": _NumberType(arguments=(str() as kind, *_)), **rest}:
-                found = _TYPE_SIZE.fullmatch(kind)
+            case {"shape": tuple() as shape, "dtype": Stored(kind="dtype", arguments=(str() as name, *_)), **rest}:
+                size = _TYPE_SIZE.fullmatch(name)
             case _:
                 raise ValueError("an array has no shape or type")
-        if found is None or not all(isinstance(n, int) and n >= 0 for n in shape):
+        if size is None or not all(isinstance(n, int) and n >= 0 for n in shape):
             raise ValueError("an array holds objects, not numbers")
-        size = int(found[1]) * (4 if kind[0] == "U" else 1) * math.prod(shape)
         if rest.get("numpy_array_alignment_bytes") is not None:
             self.stream.seek(ord(self.stream.read(1)), io.SEEK_CUR)
-        self.state, self.raw = state, self.stream.read(min(size, len(self.stream.getbuffer())))
+        length = int(size[1]) * (4 if name[0] == "U" else 1) * math.prod(shape)
+        self.state, self.raw = state, self.stream.read(min(length, len(self.stream.getbuffer())))
 
 
-class _Chumpy(Inert):
-    """chumpy's array: state["x"]."""
-
-
-class _ChumpySelection(Inert):
-    """chumpy's indexing of another array: state["a"], ["idxs"], ["preferred_shape"]."""
-
-
-class _SparseColumns(Inert):
-    """scipy's compressed sparse columns: state["data"], ["indices"], ["indptr"], ["_shape"]."""
-
-
-class _Reconstructed(Inert):
-    """copyreg's object constructor of protocols 0 and 1: arguments (class, base, base state)."""
-
-    def __new__(cls, kind: object, *_: object) -> Inert:
-        if not (isinstance(kind, type) and issubclass(kind, Inert)):
-            raise ValueError(f"it rebuilds a {type(kind).__name__}, which is not an array")
-        return kind()
-
-
-_GLOBALS: dict[tuple[str, str], type] = {
-    ("numpy", "ndarray"): Inert,
-    ("numpy", "dtype"): _NumberType,
-    ("_codecs", "encode"): _Latin1Bytes,
-    ("chumpy.ch", "Ch"): _Chumpy,
-    ("chumpy", "Ch"): _Chumpy,
-    ("chumpy.reordering", "Select"): _ChumpySelection,
+_KINDS = {
+    "object": ("builtins.object", "__builtin__.object", "numpy.ndarray"),
+    "dtype": ("numpy.dtype",),
+    "latin1": ("_codecs.encode",),
+    "array": ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"),
+    "scalar": ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar"),
+    "buffer": ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer"),
+    "chumpy": ("chumpy.ch.Ch", "chumpy.Ch"),
+    "selection": ("chumpy.reordering.Select",),
+    "columns": ("scipy.sparse.csc_matrix", "scipy.sparse.csc.csc_matrix", "scipy.sparse._csc.csc_matrix"),
+}
+"""Globals that are allowed, by what they make."""
+_GLOBALS: dict[str, type[Stored]] = {
+    "copyreg._reconstructor": _Reconstructed,
+    "copy_reg._reconstructor": _Reconstructed,
     **{
-        (f"numpy.{core}.{module}", name): kind
-        for core in ("core", "_core")
-        for module, name, kind in (
-            ("multiarray", "_reconstruct", _Array),
-            ("multiarray", "scalar", _Scalar),
-            ("numeric", "_frombuffer", _BufferArray),
-        )
+        name: kind
+        for made, names in _KINDS.items()
+        for kind in [type(made, (Stored,), {"kind": made})]
+        for name in names
     },
-    **{(f"scipy.sparse{module}", "csc_matrix"): _SparseColumns for module in ("", ".csc", "._csc")},
-    **{(module, "_reconstructor"): _Reconstructed for module in ("copy_reg", "copyreg")},
-    **{(module, "object"): Inert for module in ("__builtin__", "builtins")},
 }
 
 
@@ -188,21 +156,18 @@ class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIss
         stream = io.BytesIO(data)
         super().__init__(stream, encoding="latin1")
         self.dispatch = _Counted(len(data))  # pyright: ignore[reportAttributeAccessIssue]
-        self._path = path
-        self._joblib_array = type("_JoblibArray", (_JoblibArray,), {"stream": stream})
+        joblib_array = type("_JoblibArray", (_JoblibArray,), {"stream": stream})
+        self._path, self._globals = path, {**_GLOBALS, "joblib.numpy_pickle.NumpyArrayWrapper": joblib_array}
 
-    def find_class(self, module: str, name: str) -> type:
-        """Return an inert record. Raises FileError for other globals."""
-        if (module, name) == ("joblib.numpy_pickle", "NumpyArrayWrapper"):
-            return self._joblib_array
-        try:
-            return _GLOBALS[module, name]
-        except KeyError:
-            raise FileError(
-                self._path,
-                f"asks for the global {f'{module}.{name}':.80}, which arrays do not need, so nothing in it was run",
-                "take it from its publisher again, or convert it to .npz where you trust it",
-            ) from None
+    def find_class(self, module: str, name: str) -> type[Stored]:
+        """Return what stands for an allowed global. Raises FileError for other globals."""
+        if (wanted := f"{module}.{name}") in self._globals:
+            return self._globals[wanted]
+        raise FileError(
+            self._path,
+            f"asks for the global {wanted:.80}, which arrays do not need, so nothing in it was run",
+            "take it from its publisher again, or convert it to .npz where you trust it",
+        )
 
 
 def _unpacked(data: bytes) -> bytes:
@@ -231,18 +196,14 @@ def read_pickle(path: Path, limit: int) -> dict[str, object]:
 
 
 def load_restricted(data: bytes, path: str | Path) -> object:
-    """Load a pickle, the content of the file `path`, with inert records in place of objects.
+    """Load a pickle, the content of the file `path`, with `Stored` in place of objects.
 
     Raises:
         FileError: it names a global outside the list above, is not a pickle, or is truncated.
     """
-    try:
+    damage = (pickle.UnpicklingError, EOFError, struct.error, zlib.error)
+    with as_file_error(path, "is not a whole pickle file", "download it again", *damage):
         return _Unpickler(_unpacked(data), path).load()
-    except FileError:
-        raise
-    except _DAMAGED as error:
-        reason = " ".join(str(error).split())
-        raise FileError(path, f"is not a whole pickle file ({reason:.80})", "download it again") from error
 
 
 def array_of_objects(value: object) -> list[object]:
@@ -252,9 +213,11 @@ def array_of_objects(value: object) -> list[object]:
         ValueError: the value is not an object array.
     """
     match value:
-        case _Array(state=(_, tuple(), _NumberType(arguments=("O8" | "O", *_)), _, list() as objects)):
+        case Stored(
+            kind="array", state=(_, tuple(), Stored(kind="dtype", arguments=("O8" | "O", *_)), _, list() as objects)
+        ):
             return objects
-    raise ValueError(f"a {type(value).__name__.strip('_')} is given instead of an array of objects")
+    raise ValueError(f"{_named(value)} is given instead of an array of objects")
 
 
 def as_array(value: object, nesting: int = 0) -> np.ndarray:
@@ -266,87 +229,85 @@ def as_array(value: object, nesting: int = 0) -> np.ndarray:
     if nesting > MAX_NESTING:
         raise ValueError(f"an array is made from arrays nested more than {MAX_NESTING} deep")
     try:
-        return _as_array(value, nesting)
+        array = _as_array(value, nesting)
     except (TypeError, LookupError, AttributeError, OverflowError, MemoryError) as error:
         raise ValueError(f"a stored array is damaged ({type(error).__name__}: {error})") from error
-
-
-def _as_array(value: object, nesting: int) -> np.ndarray:
-    match value:
-        case np.ndarray():
-            array = value
-        case _Array(state=(_, tuple() as shape, kind, column_major, raw)):
-            array = np.frombuffer(_raw_bytes(raw), _number_type(kind)).reshape(
-                shape, order="F" if column_major else "C"
-            )
-        case _BufferArray(arguments=(raw, kind, tuple() as shape, str() as order)):
-            array = np.frombuffer(_raw_bytes(raw), _number_type(kind)).reshape(
-                shape, order="F" if order == "F" else "C"
-            )
-        case _JoblibArray(state={"shape": tuple() as shape, "dtype": kind, **rest}, raw=raw):
-            array = np.frombuffer(raw, _number_type(kind)).reshape(
-                shape, order="F" if rest.get("order") == "F" else "C"
-            )
-        case _Scalar(arguments=(kind, raw)):
-            array = np.frombuffer(_raw_bytes(raw), _number_type(kind)).reshape(())
-        case _ChumpySelection(state={"a": source, "idxs": indices, **rest}):
-            array = as_array(source, nesting + 1).ravel()[as_array(indices, nesting + 1)]
-            if "preferred_shape" in rest:
-                array = array.reshape(tuple(int(n) for n in as_array(rest["preferred_shape"], nesting + 1)))
-        case _Chumpy(state={"x": content}):
-            array = as_array(content, nesting + 1)
-        case _SparseColumns(state={"data": data, "indices": indices, "indptr": starts, "_shape": shape}):
-            array = _dense(*(as_array(part, nesting + 1) for part in (data, indices, starts, shape)))
-        case list() | tuple() | int() | float():
-            _check_count(value)
-            array = np.asarray(value)
-        case _:
-            raise ValueError(f"a {type(value).__name__.strip('_')} is given instead of an array of numbers")
     if array.dtype.kind not in "biuf":
         raise ValueError(f"an array holds {array.dtype} where numbers belong")
     return array
 
 
+def _as_array(value: object, nesting: int) -> np.ndarray:
+    def part(stored: object) -> np.ndarray:
+        return as_array(stored, nesting + 1)
+
+    match value:
+        case np.ndarray():
+            return value
+        case Stored(kind="array", state=(_, tuple() as shape, kind, by_columns, raw)):
+            return _numbers(raw, kind, shape, by_columns)
+        case Stored(kind="buffer", arguments=(raw, kind, tuple() as shape, str() as order)):  # of protocol 5
+            return _numbers(raw, kind, shape, order == "F")
+        case _JoblibArray(state={"shape": shape, "dtype": kind, **rest}, raw=raw):
+            return _numbers(raw, kind, shape, rest.get("order") == "F")
+        case Stored(kind="scalar", arguments=(kind, raw)):
+            return _numbers(raw, kind, (), False)
+        case Stored(kind="selection", state={"a": source, "idxs": indices, **rest}):
+            chosen = part(source).ravel()[part(indices)]
+            return chosen.reshape([int(n) for n in part(rest.get("preferred_shape", list(chosen.shape)))])
+        case Stored(kind="chumpy", state={"x": content}):
+            return part(content)
+        case Stored(kind="columns", state={"data": data, "indices": indices, "indptr": starts, "_shape": shape}):
+            return _dense(part(data), part(indices), part(starts), part(shape))
+        case list() | tuple() | int() | float():
+            _check_count(value)
+            return np.asarray(value)
+    raise ValueError(f"{_named(value)} is given instead of an array of numbers")
+
+
+def _named(value: object) -> str:
+    return f"a {value.kind if isinstance(value, Stored) else type(value).__name__}"
+
+
 def _check_count(value: object) -> None:
     """Raise ValueError for too many numbers in nested lists; one list may be contained many times."""
-    level, count = [value], 1
-    for _ in range(MAX_NESTING + 1):
+    level, count = [value], 0
+    for _ in range(MAX_NESTING + 2):
         lists = [entry for entry in level if isinstance(entry, list | tuple)]
         count += sum(map(len, lists))
         if count > MOST_LISTED:
             raise ValueError(f"a list holds more than {MOST_LISTED} numbers")
         level = [entry for inner in lists for entry in inner]
-        if not level:
-            return
-    raise ValueError(f"lists are nested more than {MAX_NESTING} deep")
+    if level:
+        raise ValueError(f"lists are nested more than {MAX_NESTING} deep")
 
 
-def _number_type(kind: object) -> np.dtype:
-    if not isinstance(kind, _NumberType) or not kind.arguments or not _NUMBER_TYPE.fullmatch(str(kind.arguments[0])):
-        raise ValueError("an array holds elements that are not numbers")
-    order = kind.state[1] if isinstance(kind.state, tuple) else "|"
-    return np.dtype(str(kind.arguments[0])).newbyteorder(order if order in ("<", ">") else "=")
-
-
-def _raw_bytes(raw: object) -> bytes | bytearray:
-    if isinstance(raw, _Latin1Bytes) and raw.arguments[1:] in (("latin1",), ("latin-1",)):
-        raw = raw.arguments[0]
-    if isinstance(raw, str):
-        return raw.encode("latin1")
-    if isinstance(raw, bytes | bytearray):
-        return raw
-    raise ValueError(f"a {type(raw).__name__.strip('_')} is given instead of an array's bytes")
+def _numbers(raw: object, kind: object, shape: tuple[int, ...], by_columns: bool) -> np.ndarray:
+    """The array of stored bytes, which protocol 2 writes as text."""
+    match kind:
+        case Stored(kind="dtype", arguments=(str() as name, *_), state=state) if _NUMBER_TYPE.fullmatch(name):
+            order = state[1] if isinstance(state, tuple) and state[1] in ("<", ">") else "="
+        case _:
+            raise ValueError("an array holds elements that are not numbers")
+    match raw:
+        case Stored(kind="latin1", arguments=(raw, "latin1" | "latin-1")):
+            pass
+    content = raw.encode("latin1") if isinstance(raw, str) else raw
+    if not isinstance(content, bytes | bytearray):
+        raise ValueError(f"{_named(raw)} is given instead of an array's bytes")
+    return np.frombuffer(content, np.dtype(name).newbyteorder(order)).reshape(shape, order="F" if by_columns else "C")
 
 
 def _dense(data: np.ndarray, indices: np.ndarray, starts: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """The matrix of compressed sparse columns."""
     rows, columns = (int(n) for n in shape)
-    if min(rows, columns) < 0 or rows * columns > MOST_NUMBERS or len(starts) != columns + 1:
-        raise ValueError(f"a sparse matrix claims {rows} x {columns} entries, which its other parts contradict")
     counts = np.diff(starts)
-    if starts[0] != 0 or (counts < 0).any() or not len(data) == len(indices) == starts[-1]:
-        raise ValueError("a sparse matrix has columns that do not follow each other")
-    if len(indices) and not 0 <= indices.min() <= indices.max() < rows:
-        raise ValueError(f"a sparse matrix has an entry outside its {rows} rows")
+    if not (
+        min(rows, columns) >= 0 and rows * columns <= MOST_NUMBERS and len(starts) == columns + 1
+        and starts[0] == 0 and (counts >= 0).all() and len(data) == len(indices) == starts[-1]
+        and 0 <= indices.min(initial=0) <= indices.max(initial=0) < max(rows, 1)
+    ):  # fmt: skip
+        raise ValueError(f"a sparse matrix claims {rows} x {columns} entries, which its other parts contradict")
     dense = np.zeros((rows, columns), data.dtype)
     np.add.at(dense, (indices, np.repeat(np.arange(columns), counts)), data)
     return dense

@@ -10,7 +10,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -37,7 +37,6 @@ VOLUME_RADIUS = 10.0
 """Metres: the marcher's unit, so that its scale 10 / h is the reciprocal half extent of a box of h metres (SPEC 2)."""
 ENLARGED_BELOW, ENLARGED_BY = 350.0, 70.0
 """At inference, scales below the first are lowered by the second: boxes beyond 28.6 mm grow (SPEC 1.12)."""
-Chain = Literal["released", "trailing"]
 
 
 def rest_half_extent(position: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
@@ -78,7 +77,6 @@ def write_imported(
     unet: UNetConfig,
     body_setup: BodySetup,
     reference: Reference,
-    chain: Chain,
     card: Mapping[str, Any],
 ) -> None:
     """Write the file, atomically; `denoiser` uses the names of `SlabUNet`. Raises OSError."""
@@ -89,7 +87,7 @@ def write_imported(
         "kind": RELEASED,
         "schedule": SCHEDULE,
         "full_density": FULL_DENSITY,
-        "chain": chain,
+        "chain": "released",
         "body": body_setup.files.to_json(),
         "config": dataclasses.asdict(unet),
     }

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
@@ -30,18 +27,16 @@ def march(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     *,
     span: Span | None = None,
-    background: Float[Tensor, "*h w 3"] | Sequence[float] | None = None,
 ) -> Rendering:
     """Render `primitives` from `camera`: premultiplied linear rgb, alpha and depths (metres), [*b, H, W].
 
     The leading dimensions of primitives, camera and span broadcast to *b: humans [p, 1] and cameras [v] give images
     [p, v, H, W]. Several humans in one image form one set of boxes (`Primitives.together`). `march_reference` defines
-    the rule; the settings `RELEASED` reproduce the released code. A linear `background`, [3] or [*b, H, W, 3], is
-    composited behind rgb and does not change alpha. Rotations that reflect mirror the contents of a box; boxes with an
-    extent of zero or less are not rendered.
+    the rule; the settings `RELEASED` reproduce the released code. Rotations that reflect mirror the contents of a box;
+    boxes with an extent of zero or less are not rendered.
 
         >>> image = pd.march(boxes, camera)
-        >>> image.save("anna.png")  # transparent
+        >>> image.save("anna.png")  # transparent; over a colour: image.over((1.0, 1.0, 1.0))
 
     Differentiable in every tensor except the span. float32 runs on the fast back end of its device (`march_cpu`, or
     `march_cuda` if Triton is installed; for Apple GPUs `march_cpu`), everything else on `march_reference`, which is
@@ -49,7 +44,9 @@ def march(
     """
     check_one_device(primitives, camera, span)
     if _borrows_cpu(primitives.position.device):
-        return _march_on_cpu(primitives, camera, settings, span, background)
+        limits = None if span is None else span.to("cpu")
+        rendering = march(primitives.to("cpu"), camera.to("cpu"), settings, span=limits)
+        return rendering.to(primitives.position.device)
     if camera.intrinsics.device.type == "cpu":  # on GPUs the kernels check it, as reading it here would synchronise
         check_camera(camera)
     if settings.pixel_centre != 0.5:
@@ -57,28 +54,12 @@ def march(
         camera = camera.moved_in_picture(shift, shift)
     batch = _batch_shape(primitives, camera, span)
     if cuda.available(primitives.position.device) and cuda.supports(primitives, camera):
-        rendering = _march_at_once(primitives, camera, settings, span, batch)
-    else:
-        rendering = _march_one_by_one(primitives, camera, settings, span, batch)
-    return rendering if background is None else _over(rendering, background)
+        return _march_at_once(primitives, camera, settings, span, batch)
+    return _march_one_by_one(primitives, camera, settings, span, batch)
 
 
 def _borrows_cpu(device: torch.device) -> bool:
     return device.type == "mps"  # no back end of its own, and no float64
-
-
-def _march_on_cpu(
-    primitives: Primitives,
-    camera: Camera,
-    settings: MarchSettings,
-    span: Span | None,
-    background: Float[Tensor, "*h w 3"] | Sequence[float] | None,
-) -> Rendering:
-    """Render there, differentiably, and return the images on the device of the primitives."""
-    behind = background.cpu() if isinstance(background, Tensor) else background
-    limits = None if span is None else span.to("cpu")
-    rendering = march(primitives.to("cpu"), camera.to("cpu"), settings, span=limits, background=behind)
-    return rendering.to(primitives.position.device)
 
 
 def _march_one_by_one(
@@ -183,17 +164,3 @@ def _stacked(pictures: list[Rendering], batch: torch.Size) -> Rendering:
     return Rendering(
         **{name: torch.stack([getattr(p, name) for p in pictures]).unflatten(0, tuple(batch)) for name in names}
     )
-
-
-def _over(rendering: Rendering, background: Float[Tensor, "*h w 3"] | Sequence[float]) -> Rendering:
-    behind = torch.as_tensor(background, dtype=rendering.rgb.dtype, device=rendering.rgb.device)
-    try:
-        rgb = rendering.rgb + (1 - rendering.alpha)[..., None] * behind
-    except RuntimeError:
-        rgb = behind
-    if rgb.shape != rendering.rgb.shape:
-        raise ValueError(
-            f"the background has shape {tuple(behind.shape)}: give 3 linear values or an image "
-            f"{tuple(rendering.rgb.shape)}"
-        )
-    return dataclasses.replace(rendering, rgb=rgb)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -85,16 +85,10 @@ class PerceptualLoss(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, layers: Sequence[str] = VGG_LAYERS, weights: Sequence[float] = VGG_LAYER_WEIGHTS) -> None:
-        """Build the loss with random features, which `load_perceptual` replaces.
-
-        Raises ValueError for an unknown layer, or another number of weights than of layers.
-        """
+    def __init__(self) -> None:
+        """Build the loss with random features, which `load_perceptual` replaces."""
         super().__init__()
-        if len(layers) != len(weights) or not layers:
-            raise ValueError(f"{len(layers)} layers and {len(weights)} weights: give a weight for each layer")
-        self.network = PictureFeatures(VGG19, layers)
-        self.layer_weights = tuple(weights)
+        self.network = PictureFeatures(VGG19, VGG_LAYERS)
         for name, values in zip(("mean", "std"), IMAGENET, strict=True):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
@@ -110,23 +104,20 @@ class PerceptualLoss(nn.Module):
         with torch.no_grad():
             wanted = self.network(self._prepared(target))
         seen = self.network(self._prepared(image))
-        terms = zip(self.layer_weights, seen, wanted, strict=True)
+        terms = zip(VGG_LAYER_WEIGHTS, seen, wanted, strict=True)
         return torch.stack([weight * (a - b).abs().mean() for weight, a, b in terms]).sum()
 
     def _prepared(self, pictures: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "n 3 H W"]:
         return (pictures.reshape(-1, *pictures.shape[-3:]).movedim(-1, 1) - self.mean) / self.std
 
 
-def load_perceptual(
-    path: Path | str, layers: Sequence[str] = VGG_LAYERS, weights: Sequence[float] = VGG_LAYER_WEIGHTS
-) -> PerceptualLoss:
+def load_perceptual(path: Path | str) -> PerceptualLoss:
     """The loss with VGG19 from a file in torchvision's layout (vgg19-dcbb9e9d.pth, or its `features` alone).
 
     Raises:
         FileNotFoundError: there is no such file.
         FileError: it is damaged, or of another network.
-        ValueError: as `PerceptualLoss`.
     """
-    loss = PerceptualLoss(layers, weights)
+    loss = PerceptualLoss()
     load_matching(loss.network, read_weights(path), "torchvision's VGG19", str(path))
     return loss

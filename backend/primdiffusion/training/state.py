@@ -99,8 +99,8 @@ class TrainingState:
             tensors, place = tensor_file.read(path)
             step, seconds = int(place.pop("step")), float(place.pop("seconds"))
             for name, module in (("network", self.network), ("average", self.average)):
-                module.load_state_dict(_under(tensors, name))
-            self._load_moments(_under(tensors, "optimiser"))
+                module.load_state_dict(tensor_file.under(tensors, f"{name}."))
+            self._load_moments(tensor_file.under(tensors, "optimiser."))
         if (before := place.get("optimiser", self._kind)) != self._kind:
             raise ValueError(
                 f"{path} was trained with {before}, but this device trains with {self._kind} (Muon needs "
@@ -140,10 +140,6 @@ def learning_rate_factor(step: int, steps: int) -> float:
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
     return next((key for key, value in tensors.items() if not torch.isfinite(value).all()), None)
-
-
-def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {key.removeprefix(f"{prefix}."): value for key, value in tensors.items() if key.startswith(f"{prefix}.")}
 
 
 def accelerator_of(mixed_precision: str = "no") -> Accelerator:

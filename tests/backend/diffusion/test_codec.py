@@ -38,11 +38,9 @@ def codec(cells):
     return fit_codec(cells, channels=16, generator=torch.Generator().manual_seed(1))
 
 
-def test_basis_is_orthonormal_so_projected_noise_is_standard(codec):
-    noise = torch.randn(4000, VALUES, generator=torch.Generator().manual_seed(2))
+def test_the_basis_is_orthonormal(codec):
     for basis in codec.basis:
         assert torch.allclose(basis @ basis.T, torch.eye(16), atol=1e-5)
-        assert (torch.cov((noise @ basis.T).T) - torch.eye(16)).abs().max() < 0.1
 
 
 def test_each_region_of_the_body_has_a_basis_that_its_mirror_image_shares(codec):

@@ -6,7 +6,6 @@ import torch
 from diffusers import DDPMScheduler
 from primdiffusion.diffusion.schedule import (
     CLEAN,
-    Schedule,
     early_steps,
     fine_linear,
     linear,
@@ -95,7 +94,3 @@ def test_half_log_snr_is_the_logarithm_of_signal_over_noise(schedule):
     assert schedule.half_log_snr_gain(900, 100) == pytest.approx(
         schedule.half_log_snr_gain(900, 500) + schedule.half_log_snr_gain(500, 100), abs=1e-12
     )
-
-
-def test_half_log_snr_without_a_signal_is_minus_infinite():
-    assert Schedule(torch.tensor([0.5, 0.0], dtype=torch.float64)).half_log_snr(1) == -math.inf

@@ -62,9 +62,9 @@ def differs(a: Payload, b: Payload) -> bool:
     return any((x - y).abs().max() > 1e-6 for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
 
 
-@pytest.mark.parametrize("preset", ARCHITECTURES)
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_gives_a_payload(preset):
-    config = ARCHITECTURES[preset]
+    config = PRESETS[preset]
     torch.manual_seed(0)
     with torch.no_grad():
         payload = Encoder(config)(seen_from(config), poses())
@@ -316,15 +316,6 @@ def test_nothing_in_the_network_chooses_a_device(preset):
     payload = encoder(seen_from(config).to("meta"), poses().to("meta"))
     assert payload.rgb.is_meta
     assert payload.density.is_meta
-
-
-def test_file_precision_changes_little():
-    encoder, found, pose = encoder_of(TINY), seen_from(TINY), poses()
-    with torch.no_grad():
-        before = encoder(found, pose)
-        encoder.load_state_dict({name: value.half().float() for name, value in encoder.state_dict().items()})
-        after = encoder(found, pose)
-    assert (encode_srgb(before.rgb) - encode_srgb(after.rgb)).abs().max() < 0.01
 
 
 @pytest.mark.parametrize(("resize", "shape"), [("same", (5, 8, 8)), ("down", (5, 4, 4)), ("up", (5, 16, 16))])

@@ -21,7 +21,7 @@ from primdiffusion.encoder.unproject import (
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.geometry.surface import surface_points, vertex_normals
-from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors, default_texels
+from primdiffusion.primitives.anchors import attach, default_anchors, default_texels
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S
 from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.march import march
@@ -131,14 +131,6 @@ def test_views_count_by_their_cosine_to_the_power(facing):
     found = unproject_texels(views_of([plain(RED, 128), plain(BLUE, 128)], cameras), body.template, facing, body)
     share = 1 / (1 + math.cos(angle) ** facing)
     assert found.rgb[0, :, 128, 128].float().tolist() == pytest.approx([255 * share, 0, 255 * (1 - share)], abs=1.5)
-
-
-def test_covered_is_the_least_mask_and_seen_the_share_of_the_views():
-    body, cameras = plates(0.0), [filling(0, 16)] * 4
-    pictures = [plain((9, 9, 9, mask)) for mask in (255, 255, 40, 255)]
-    found = unproject_texels(views_of(pictures, cameras), body.template, 2, body)
-    assert found.covered[0, 128, 128] == 40
-    assert found.seen[0, 128, 128] == 255 * 3 // 4
 
 
 def away(camera: Camera) -> Camera:
@@ -269,27 +261,6 @@ def test_voxels_are_those_of_the_slow_twin_in_the_payloads_order():
     points = FRAMES.position[k] + (FRAMES.rotation[k] @ (FRAMES.half_extent[k] * local)[..., None])[..., 0]
     places = list(zip(d.tolist(), (k // GRID * S + h).tolist(), (k % GRID * S + w).tolist(), strict=True))
     assert agrees_with_the_twin(found, places, points, FRAMES.rotation[k, :, 2], views, 2) > 80
-
-
-def test_voxels_in_front_of_the_body_are_seen_and_those_inside_are_not():
-    views = views_of([plain(RED, 40)] * 2, [body_camera(0.0), body_camera(math.pi)])
-    seen = unproject_voxels(views, POSED, FRAMES, ONES, 2).seen.unflatten(-1, (GRID, S)).unflatten(-3, (GRID, S))
-    torso = (default_anchors().chart == CHARTS.index("torso")).reshape(GRID, GRID)
-    across = FRAMES.rotation[:, 2, 2].reshape(GRID, GRID).abs() > 0.8
-    inside, outside = (seen[d, :, 3].movedim(-1, 0)[3][torso & across] for d in (0, S - 1))
-    assert (inside > 0).float().mean() < 0.02
-    assert (outside > 0).float().mean() > 0.95
-
-
-def test_the_far_side_is_hidden():
-    found = unproject_texels(views_of([plain(RED, 200)], [body_camera(0.0, 200)]), POSED, 0)
-    face, barycentric = default_texels()
-    normals = surface_points(vertex_normals(POSED, BODY.faces), BODY.faces, face.flatten(), barycentric.flatten(0, 1))
-    torso = (default_anchors().chart == CHARTS.index("torso")).reshape(GRID, GRID)
-    torso = torso.repeat_interleave(S, 0).repeat_interleave(S, 1)
-    front, back = (found.seen[0][torso & (sign * normals[:, 2].reshape(SIDE, SIDE) > 0.6)] for sign in (1, -1))
-    assert (front == 255).float().mean() > 0.9
-    assert (back > 0).float().mean() < 0.01
 
 
 def test_what_the_marcher_draws_of_a_voxel_is_found_at_this_voxel():

@@ -131,12 +131,6 @@ def test_frames_that_are_not_there_are_rejected(captures):
         list(evaluate(Grey(), captures, EvaluationSettings(("nobody",), size=32)))
 
 
-@pytest.mark.parametrize(("name", "value"), [("given_views", 0), ("size", 10)])
-def test_impossible_settings_are_rejected(name, value):
-    with refused(ValueError, name, str(value)):
-        EvaluationSettings(**{name: value})
-
-
 def test_a_picture_is_most_like_itself():
     rgba = torch.randint(0, 256, (24, 20, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     metrics = image_metrics(rgba / 255, rgba / 255)

@@ -174,15 +174,12 @@ def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypa
     monkeypatch.setattr(command, "load_checkpoint", lambda path, device: tiny_model())
     real = folder(tmp_path / "real", 8, 1)
     line = ["generation", "--real", str(real), "--count", "2", "--poses", "2", "--views", "2"]
-    records = []
-    for name in ("one", "two"):
-        command.run([*line, "--steps", "2", "--json", str(tmp_path / f"{name}.json")])
-        records.append(json.loads((tmp_path / f"{name}.json").read_text()))
-        assert records[-1]["rows"]["generated"].pop("fps")["value"] > 0
-    assert records[0] == records[1]
-    cells = records[0]["rows"]["generated"]
+    command.run([*line, "--steps", "2", "--json", str(tmp_path / "a.json")])
+    record = json.loads((tmp_path / "a.json").read_text())
+    cells = record["rows"]["generated"]
+    assert cells.pop("fps")["value"] > 0
     assert all(cells[column]["value"] is not None for column in ("own_distance", "own_pckh", "own_depth"))
     assert set(cells) == set(COLUMNS) - {"fps"}
-    assert records[0]["choices"]["resolution"] == "256 x 256 x 8"
-    assert records[0]["rows"]["floor"]["own_pckh"]["value"] == load_pose_depth_network().card["errors"]["pckh"]
+    assert record["choices"]["resolution"] == "256 x 256 x 8"
+    assert record["rows"]["floor"]["own_pckh"]["value"] == load_pose_depth_network().card["errors"]["pckh"]
     assert "| floor |" in capsys.readouterr().out

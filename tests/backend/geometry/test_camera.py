@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from jaxtyping import Float
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.records import TensorRecord, check_shapes
-from primdiffusion.geometry.rotation import axis_angle_to_matrix, matrix_to_axis_angle, skew
+from primdiffusion.geometry.rotation import axis_angle_to_matrix, matrix_to_axis_angle
 from scipy.spatial.transform import Rotation
 from support.errors import refused
 from torch import Tensor
@@ -99,11 +99,6 @@ def test_half_turns_keep_their_axis_up_to_sign():
 def test_gradients_are_right_through_zero_rotation():
     v = torch.cat([torch.zeros(1, 3), 1e-5 * torch.ones(1, 3), torch.tensor([[0.4, -1.0, 2.0]])]).double()
     torch.autograd.gradcheck(axis_angle_to_matrix, v.requires_grad_())
-
-
-def test_skew_is_the_cross_product():
-    a, b = axis_angles(10), axis_angles(10, seed=1)
-    torch.testing.assert_close((skew(a) @ b[..., None]).squeeze(-1), torch.linalg.cross(a, b))
 
 
 @dataclasses.dataclass(frozen=True)

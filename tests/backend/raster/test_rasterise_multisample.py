@@ -140,27 +140,6 @@ def test_captures_and_pictures_of_meshes_have_the_same_pixels(samples):
     assert np.abs(shot.rgb - picture.rgb)[both].mean() < 1e-4
 
 
-def test_a_triangle_across_the_cameras_plane_is_seen_as_far_as_it_is_in_front():
-    part = dataclasses.replace(
-        square([[RED]]), vertices=np.array([[-9, -1, -9], [9, -1, -9], [9, -1, 9], [-9, -1, 9.0]])
-    )
-    shot = shot_of(part, view=front(0, 20, 40), samples=1)  # stands inside of a floor one metre below
-    assert not shot.alpha[:20].any()
-    rows = np.arange(23, 40)  # beyond row 22 the floor has ended
-    np.testing.assert_allclose(shot.depth[rows, 20], 20 / (rows + 0.5 - 20), rtol=1e-5)
-
-
-def test_nothing_behind_the_camera_or_beside_the_picture_is_seen():
-    for centre in ((0, 0, 9), (50, 0, 0)):
-        shot = shot_of(box(centre=centre), view=front(3, 40, 40))
-        assert not shot.alpha.any()
-
-
-def test_no_ray_slips_between_triangles():
-    shot = shot_of(box(half=3), view=look_at(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2, 3]), 1.5, 64, 64))
-    assert shot.alpha.min() == 1
-
-
 def test_fine_textures_are_averaged_not_sampled():
     checks = np.indices((512, 512)).sum(0) % 2
     texture = np.where(checks[..., None], np.array(WHITE), np.array((0, 0, 0, 255))).astype(np.uint8)

@@ -22,8 +22,6 @@ from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, place_skinned
 from primdiffusion.human_file import load_human, save_human
-from primdiffusion.primitives.anchors import build_anchors
-from primdiffusion.primitives.body_setup import body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
 from released_files import TINY, body_arrays, random_network, save_body, save_released, state, template
 from support.errors import refused
@@ -237,19 +235,6 @@ def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(t
     assert not (tmp_path / "imported.safetensors").exists()
 
 
-def test_uv_files_of_every_kind_give_the_same_anchors(folder, tmp_path):
-    smpl, obj = folder / "SMPL_NEUTRAL.pkl", folder / "smpl_uv.obj"
-    body = load_body(smpl, uv=obj)
-    np.savez(tmp_path / "uv.npz", vt=body.uv, ft=body.uv_faces)
-    np.save(tmp_path / "vt.npy", body.uv)
-    np.save(tmp_path / "ft.npy", body.uv_faces)
-    expected = build_anchors(body, "released")
-    for uv in ((tmp_path / "uv.npz",), (tmp_path / "vt.npy", tmp_path / "ft.npy"), (obj,)):
-        anchors = body_setup_from_files(smpl, uv).anchors
-        assert torch.equal(anchors.face, expected.face)
-        torch.testing.assert_close(anchors.barycentric, expected.barycentric)
-
-
 def test_the_reference_subject_sets_sizes_and_shape(folder, tmp_path):
     subject = tmp_path / "seq_000016-rp_alison_rigged_002"
     (subject / "outputs_re_fitting").mkdir(parents=True)
@@ -259,13 +244,12 @@ def test_the_reference_subject_sets_sizes_and_shape(folder, tmp_path):
         "global_orient": np.zeros((2, 3)), "body_pose": np.zeros((2, 69)), "betas": betas, "transl": np.ones((2, 3)),
     }  # fmt: skip
     np.savez(subject / "outputs_re_fitting" / "refit_smpl_2nd.npz", smpl=np.array(parameters, dtype=object))
-    arguments = line(folder, "--reference", str(subject), "--chain", "trailing")
+    arguments = line(folder, "--reference", str(subject))
     out = tmp_path / "imported.safetensors"
     arguments[arguments.index(str(folder / "imported.safetensors"))] = str(out)
     cli.run(arguments)
     model, plain = load_checkpoint(out), load_checkpoint(folder / "imported.safetensors")
     assert (model.body_setup.anchors.rest_half_extent < 0.7 * plain.body_setup.anchors.rest_half_extent).any()
-    assert model.chain(1000, 10)[0] == 999
     shapes = model.betas(torch.zeros(2, 1, 1, 1), [1, 2])
     assert shapes.tolist() == [[-5.0] + [0.0] * 9] * 2, "betas beyond what people files hold are limited"
     assert plain.betas(torch.zeros(1, 1, 1, 1), [1]).abs().max() == 0

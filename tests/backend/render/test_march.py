@@ -81,21 +81,6 @@ def test_gradients_of_a_batch_are_the_sums_over_its_pictures():
             torch.testing.assert_close(getattr(leaves, name).grad[p], tensor.grad, rtol=1e-4, atol=1e-5)
 
 
-def test_the_background_fills_what_the_boxes_leave():
-    boxes, camera = one(people(0), 0), one(views(1), 0)
-    plain = march(boxes, camera)
-    grey = march(boxes, camera, background=(0.2, 0.4, 0.6))
-    torch.testing.assert_close(grey.rgb, plain.rgb + (1 - plain.alpha)[..., None] * torch.tensor([0.2, 0.4, 0.6]))
-    assert torch.equal(grey.alpha, plain.alpha)
-    picture = torch.rand((11, 14, 3), generator=torch.Generator().manual_seed(0))
-    behind = march(boxes, camera, background=picture)
-    empty = plain.alpha == 0
-    assert empty.any()
-    assert torch.equal(behind.rgb[empty], picture[empty])
-    with refused(ValueError, "background", "(4,)"):
-        march(boxes, camera, background=(1.0, 1.0, 1.0, 1.0))
-
-
 def test_spans_belong_to_their_pictures():
     boxes, cameras = one(people(0), 0), views(2)
     near, far = torch.zeros((2, 11, 14)), torch.full((2, 11, 14), torch.inf)
@@ -131,10 +116,10 @@ def test_released_settings_look_through_pixel_corners_every_millimetre_in_index_
         torch.testing.assert_close(getattr(fast, name)[finite].double(), getattr(got, name)[finite], atol=2e-3, rtol=0)
 
 
-def test_gradients_reach_the_boxes_through_the_released_settings_and_backgrounds():
+def test_gradients_reach_the_boxes_through_the_released_settings():
     boxes, camera = one(people(3), 0), one(views(1), 0)
     leaves = boxes.map(lambda tensor: tensor.clone().requires_grad_())
-    march(leaves, camera, RELEASED, background=(1.0, 1.0, 1.0)).rgb.sum().backward()
+    march(leaves, camera, RELEASED).rgb.sum().backward()
     assert all(tensor.grad.abs().sum() > 0 for tensor in vars(leaves).values())
 
 
@@ -304,9 +289,9 @@ def test_a_scene_far_from_the_origin_is_drawn_as_it_is_there(offset):
 
 def test_a_device_without_a_back_end_borrows_the_cpu_s(monkeypatch):
     primitives, camera = one(people(0), 0), one(views(1), 0)
-    expected = march(primitives, camera, background=(1.0, 0.5, 0.0))
+    expected = march(primitives, camera)
     asked = iter((True, False))
     monkeypatch.setattr("primdiffusion.render.march._borrows_cpu", lambda _device: next(asked))
-    found = march(primitives, camera, background=torch.tensor([1.0, 0.5, 0.0]))
+    found = march(primitives, camera)
     assert torch.equal(found.rgb, expected.rgb)
     assert next(asked, None) is None

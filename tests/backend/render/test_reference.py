@@ -9,11 +9,10 @@ import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render import reference
-from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span, strides_of
-from primdiffusion.render.reference import march_reference, trilinear
+from primdiffusion.render.lattice import MarchSettings, Span
+from primdiffusion.render.reference import march_reference
 from scipy.integrate import quad
 from support.errors import refused
 
@@ -112,66 +111,6 @@ def test_one_box_is_density_times_the_integral_of_the_window():
     assert got.depth.item() == pytest.approx(0.5, abs=1e-4)
 
 
-def test_opacity_is_additive_and_clamped_not_exponential():
-    thin, thick, twice = (
-        march_reference(one_box(density=density), single_ray(0.5)).alpha.item() for density in (3.0, 300.0, 6.0)
-    )
-    assert twice == pytest.approx(2 * thin, rel=1e-12)
-    assert thick == 1.0
-
-
-def test_an_opaque_surface_is_seen_where_it_stands():
-    got = march_reference(one_box(half_extent=0.05, density=5000.0), single_ray(0.5))
-    # The window lets density in over the first tenth of the half extent; the 4 mm lattice does the rest.
-    assert got.alpha.item() == 1.0
-    assert 0.45 <= got.depth.item() <= 0.459
-    assert 0.45 <= got.first_hit.item() <= 0.459
-    torch.testing.assert_close(got.rgb[0, 0], torch.tensor([0.2, 0.4, 0.8], dtype=torch.float64))
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_voxel_axes_d_h_w_run_along_n_b_t(axis):
-    """The density sits in the last layer of one voxel axis; only rays at that end of the box may meet it."""
-    box = one_box(half_extent=0.05, density=0.0)
-    layer = [slice(None)] * 4
-    layer[3 - axis] = slice(7, 8)
-    box.density[tuple(layer)] = 50.0
-    towards = torch.zeros(3, dtype=torch.float64)
-    towards[axis] = 0.04
-    camera = single_ray(0.5) if axis != 2 else camera_at((0.5, 0.0, 0.0), width=1, height=1)  # looks across the axis
-    for sign, seen in ((1, True), (-1, False)):
-        moved = dataclasses.replace(box, position=-sign * towards[None])
-        assert (march_reference(moved, camera).alpha.item() > 0.01) is seen
-
-
-def test_rotation_columns_are_the_boxes_axes_in_the_world():
-    """A quarter turn about z takes the dense +T end to +y; a transposed rotation would put it at -y."""
-    box = one_box(half_extent=0.05, density=0.0)
-    box.density[..., 7] = 50.0
-    turned = dataclasses.replace(box, rotation=axis_angle_to_matrix(torch.tensor([[0, 0, math.pi / 2]]).double()))
-    for offset, seen in ((-0.04, True), (0.04, False)):
-        moved = dataclasses.replace(turned, position=torch.tensor([[0, offset, 0]], dtype=torch.float64))
-        assert (march_reference(moved, single_ray(0.5)).alpha.item() > 0.01) is seen
-
-
-def test_trilinear_interpolation_repeats_an_affine_field_with_corners_at_the_faces():
-    d, h, w = torch.meshgrid(*[torch.linspace(-1, 1, 8, dtype=torch.float64)] * 3, indexing="ij")
-    field = (0.3 + 2 * w - 3 * h + 5 * d)[None, None]
-    local = torch.rand((200, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
-    local[:8] = torch.tensor(list(itertools.product((-1, 1), repeat=3)), dtype=torch.float64)
-    got = trilinear(field, torch.zeros(200, dtype=torch.int64), local)[:, 0]
-    torch.testing.assert_close(got, 0.3 + local @ torch.tensor([2, -3, 5], dtype=torch.float64), atol=1e-13, rtol=0)
-
-
-def test_a_box_gets_the_largest_stride_that_leaves_two_samples_a_voxel():
-    half_extent = torch.tensor([0.030, 0.0279, 0.0141, 0.0139, 0.004], dtype=torch.float64)
-    boxes = dataclasses.replace(
-        random_boxes(5), half_extent=half_extent[:, None] * torch.tensor([2.0, 1.0, 3.0]).double()
-    )
-    assert strides_of(boxes, MarchSettings()).tolist() == [4, 2, 2, 1, 1]
-    assert strides_of(boxes, UNIFORM_MILLIMETRE).tolist() == [1] * 5
-
-
 def test_released_order_favours_the_lower_index_at_the_saturating_sample_and_only_there():
     red, blue = one_box(density=100.0, rgb=(1, 0, 0)), one_box(density=100.0, rgb=(0, 0, 1))
     both = Primitives(*(torch.cat([getattr(red, name), getattr(blue, name)]) for name in vars(red)))
@@ -183,19 +122,6 @@ def test_released_order_favours_the_lower_index_at_the_saturating_sample_and_onl
     thin = dataclasses.replace(both, density=both.density / 100)
     torch.testing.assert_close(
         march_reference(thin, single_ray(0.5), in_order).rgb, march_reference(thin, single_ray(0.5), coarse).rgb
-    )
-
-
-def test_moving_boxes_and_camera_together_changes_nothing():
-    boxes, camera = random_boxes(10, 6), camera_at((0.1, 0.2, 0.5))
-    turn = axis_angle_to_matrix(torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64))
-    shift = torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64)
-    moved = dataclasses.replace(boxes, position=boxes.position @ turn.T + shift, rotation=turn @ boxes.rotation)
-    rotation = camera.world_to_camera[:, :3] @ turn.T
-    translation = camera.world_to_camera[:, 3] - rotation @ shift
-    followed = dataclasses.replace(camera, world_to_camera=torch.cat([rotation, translation[:, None]], dim=1))
-    torch.testing.assert_close(
-        march_reference(moved, followed).rgb, march_reference(boxes, camera).rgb, atol=1e-10, rtol=0
     )
 
 
@@ -247,7 +173,7 @@ def test_empty_and_unlimited_spans():
 def test_gradients_of_boxes_and_camera_agree_with_finite_differences(density, saturates):
     boxes = random_boxes(2, 8, density=density, size=2, spread=0.02, smallest=0.03)
     boxes = dataclasses.replace(boxes, density=boxes.density + density)
-    camera = camera_at((0.05, 0.02, 0.3), fov=0.15, width=3, height=2)
+    camera = camera_at((0.05, 0.02, 0.3), fov=0.15, width=2, height=2)
     settings = MarchSettings(step=0.01, strides=(2, 1))
     assert bool((march_reference(boxes, camera, settings).alpha == 1).any()) is saturates
     tensors = [*vars(boxes).values(), camera.intrinsics, camera.world_to_camera]

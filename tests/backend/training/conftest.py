@@ -23,8 +23,9 @@ def people(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def prepared_once(people, tmp_path_factory):
-    config, found = settings(people, tmp_path_factory.mktemp("prepared")), PersonFolder(people)
+def prepared_once(people, whole):
+    """The closed-form part of that run."""
+    config, found = settings(people, whole), PersonFolder(people)
     return config, prepare(config, found, *split_people(range(16), config.holdout, config.seed))
 
 

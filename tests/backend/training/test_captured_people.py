@@ -15,7 +15,6 @@ from primdiffusion.formats.requests import EncodeSettings
 from primdiffusion.people.stored_people import PersonFolder, read_payloads
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import choose_frames, encode_people, read_cards
-from support.errors import refused
 from support.tiny import save_tiny_encoder, tiny_encoder
 
 AS_ENCODED = EncodeSettings()
@@ -108,9 +107,3 @@ def test_one_who_fails_is_named_and_the_others_are_made(tmp_path, fails):
     assert "0000.png" in failed.out
     assert "1 of 2 humans failed" in failed.err
     assert [path.name for path in (tmp_path / "out").glob("*.npz")] == [f"{SECOND}.npz"]
-
-
-@pytest.mark.parametrize("settings", [{"views": 0}, {"looks": 0}, {"refine_steps": -1}])
-def test_settings_that_cannot_be_are_rejected(settings):
-    with refused(ValueError, next(iter(settings))):
-        EncodeSettings(**settings)

@@ -13,7 +13,6 @@ from primdiffusion.training import diffusion_task
 from primdiffusion.training.cells import CellTask
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.diffuse import MODEL, train
-from primdiffusion.training.loop import Interrupt
 from primdiffusion.training.muon import MuonAdamW
 from primdiffusion.training.run_folder import STATE
 from support import graphs
@@ -21,7 +20,7 @@ from support.runs import same_tensors
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-STEPS = 8
+STEPS = 4
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +31,6 @@ def trained(people, whole, tmp_path_factory):
         run = tmp_path_factory.mktemp("recorded") / "run"
         run.mkdir()
         os.link(whole / "prepared.safetensors", run / "prepared.safetensors")
-        return go_on(run)
-
-    def go_on(run):
         muon = NetworkTraining(steps=STEPS, batch=4, evaluate_every=2, optimiser="muon", weight_decay=0.1)
         train(settings(people, run, local=muon))
         return run
@@ -42,7 +38,7 @@ def trained(people, whole, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         make_small(patch)
         patch.setattr(diffusion_task, "has_bfloat16", lambda device: True)
-        train_there.go_on, train_there.plain = go_on, train_there()
+        train_there.plain = train_there()
         yield train_there
 
 
@@ -56,17 +52,6 @@ def test_recorded_steps_train_the_same_bits_as_steps_launched_one_by_one(trained
     assert_same(trained(), trained.plain)
     # loss and gradients, and Muon's changes; the first call of each is launched, as Triton compiles then
     assert [graph.replays for graph in found] == [STEPS - 1, STEPS - 1]
-
-
-def test_a_recorded_run_in_parts_is_bit_identical_to_one_in_one_go(trained, monkeypatch):
-    graphs.on_processors(monkeypatch)
-    with monkeypatch.context() as patch:
-        asked = []
-        patch.setattr(Interrupt, "due", lambda self: asked.append(0) or len(asked) in (3, 6))
-        run = trained()
-        trained.go_on(run)
-    assert_same(trained.go_on(run), trained.plain)
-    assert len(asked) == 6
 
 
 def test_what_cannot_be_recorded_is_launched_from_python_and_said_once(trained, monkeypatch, caplog):

@@ -63,19 +63,9 @@ def test_a_run_leaves_settings_versions_metrics_pictures_state_and_encoder(captu
     measured = [row for row in rows(config.run) if "psnr_train" in row]
     assert [row["step"] for row in measured] == [2, 4]
     assert all(np.isfinite([row["psnr_train"], row["psnr_held"]]).all() for row in measured)
-    kept = load_encoder(config.run / MODEL)
-    assert kept.card["steps"] == model.card["steps"] == 4
-    assert all(
-        torch.allclose(a, b, atol=1e-3)
-        for a, b in zip(kept.encoder.parameters(), model.encoder.parameters(), strict=True)
-    )
-
-
-def test_weights_change_and_the_average_is_what_is_kept(captures, tmp_path):
-    config = settings(captures, tmp_path / "run", steps=3)
-    fit(config)
+    assert load_encoder(config.run / MODEL).card["steps"] == model.card["steps"] == 4
     state, kept = load_file(config.run / STATE), load_file(config.run / MODEL)
-    for key, value in kept.items():
+    for key, value in kept.items():  # the average is what is kept
         assert torch.equal(state[f"average.{key}"].half(), value)
     assert any(not torch.equal(state[f"average.{key}"], state[f"network.{key}"]) for key in kept)
 
@@ -139,29 +129,9 @@ def test_a_perceptual_weight_without_a_file_is_rejected_and_a_missing_file_named
         fit(settings(captures, tmp_path / "run", loss=loss))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"batch": 0}, {"steps": 0}, {"learning_rate": float("nan")}, {"ema": 1.0}, {"workers": -1}, {"minutes": -1.0},
-     {"gradient_clip": 0.0}, {"encoder": "huge"}, {"threads": 0}],
-)  # fmt: skip
-def test_settings_that_cannot_be_are_named(captures, tmp_path, change):
-    (name,) = change
-    with refused(ValueError, name):
-        settings(captures, tmp_path / "run", **change)
-
-
 def test_losses_without_colour_are_rejected():
     with refused(ValueError, "colours"):
         LossConfig(rgb=0.0)
-    with refused(ValueError, "volume"):
-        LossConfig(volume=-1.0)
-
-
-def test_captures_without_people_are_rejected(tmp_path):
-    (tmp_path / "captures").mkdir()
-    with refused(FileNotFoundError, "finished"):
-        fit(settings(tmp_path / "captures", tmp_path / "run"))
-    assert os.listdir(tmp_path / "run") == [LOCK]
 
 
 def test_a_person_with_one_view_trains_on_it_again_and_again(own, tmp_path):

@@ -8,8 +8,6 @@ from primdiffusion.evaluation.pretrained_networks import VGG16, VGG19, PictureFe
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.training.fit_config import LossConfig
 from primdiffusion.training.fit_losses import (
-    VGG_LAYERS,
-    PerceptualLoss,
     alpha_prior,
     load_perceptual,
     loss_terms,
@@ -129,10 +127,6 @@ def test_gradients_reach_the_picture_and_no_weights(vgg_file):
     assert not any(parameter.requires_grad for parameter in loss.parameters())
 
 
-def test_only_the_layers_asked_for_are_computed(vgg_file):
-    assert len(load_perceptual(vgg_file, ["relu2_2"], [1.0]).network.features) == 9
-
-
 def test_a_file_of_another_network_is_rejected(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
     with refused(FileError, "vgg16.pth", "VGG19"):
@@ -150,10 +144,6 @@ def test_weights_that_are_not_finite_are_rejected(vgg_file, tmp_path):
 def test_wrong_requests_say_what_to_give(vgg_file, tmp_path):
     with refused(FileNotFoundError, "path"):
         load_perceptual(tmp_path / "none.pth")
-    with refused(ValueError, "relu6_1", "relu1_1", "relu1_2"):
-        PerceptualLoss(["relu6_1"], [1.0])
-    with refused(ValueError, "2 layers", "1 weights"):
-        PerceptualLoss(VGG_LAYERS[:2], [1.0])
     loss = load_perceptual(vgg_file)
     with refused(ValueError, "8 x 16 pixels", "VGG19"):
         loss(torch.rand(16, 8, 3), torch.rand(16, 8, 3))

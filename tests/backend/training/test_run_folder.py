@@ -8,7 +8,7 @@ import fit_scenes
 import pytest
 import tyro
 from accelerate import PartialState
-from diffuse_runs import make_small, settings
+from diffuse_runs import settings
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.runtime.failures import MissingPackageError
 from primdiffusion.runtime.worker_process import lock_folder
@@ -78,41 +78,37 @@ class Wandb(types.ModuleType):
         self.finished = True
 
 
-def test_tensorboard_gets_every_number(people, run, monkeypatch):
+LINES = [{"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.25, "rms_500": 0.1}]
+
+
+def write_lines(run, tracker):
+    PartialState()  # as a run has, and as tests before this one may have: trackers log through it
+    config = settings(run, run, tracker=tracker)
+    with open_metrics(config) as metrics:
+        for line in LINES:
+            metrics.append(line)
+    assert rows(run) == LINES
+
+
+def test_tensorboard_gets_every_number(tmp_path):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    make_small(monkeypatch)
-    config = settings(people, run, tracker="tensorboard", **FEW)
-    train(config)
-    events = EventAccumulator(str(config.run / "tensorboard"), size_guidance={"scalars": 0}).Reload()
-    for row in rows(config.run):
-        for name, value in row.items():
+    write_lines(tmp_path, "tensorboard")
+    events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"scalars": 0}).Reload()
+    for line in LINES:
+        for name, value in line.items():
             sent = {event.step: event.value for event in events.Scalars(name)}
-            assert sent[row["step"]] == pytest.approx(value, rel=1e-5)
+            assert sent[line["step"]] == pytest.approx(value, rel=1e-5)
 
 
-def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, run, monkeypatch):
-    make_small(monkeypatch)
+def test_wandb_is_started_in_the_run_folder_and_gets_lines_as_they_are_written(tmp_path, monkeypatch):
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
-    config = settings(people, run, tracker="wandb", **FEW)
-    train(config)
-    assert wandb.settings == {"project": "primdiffusion", "name": "run", "dir": str(config.run)}
+    write_lines(tmp_path, "wandb")
+    assert wandb.settings == {"project": "primdiffusion", "name": tmp_path.name, "dir": str(tmp_path)}
+    assert wandb.lines == [(line["step"], line) for line in LINES]
     assert wandb.finished
-    steps = [step for step, _ in wandb.lines]
-    assert steps == sorted(steps)
-    assert len(wandb.lines) == len(rows(config.run))
-    assert any("loss" in values for _, values in wandb.lines)
-
-
-def test_lines_are_sent_as_they_are_written(tmp_path, monkeypatch):
-    PartialState()  # as a run has, and as tests before this one may have: trackers log through it
-    wandb = Wandb()
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    with open_metrics(settings(tmp_path, tmp_path, tracker="wandb")) as metrics:
-        metrics.append({"step": 3, "loss": 0.5})
-    assert wandb.lines == [(3, {"step": 3, "loss": 0.5})]
 
 
 def test_without_the_package_one_sentence_and_no_folder(people, tmp_path, monkeypatch):

@@ -20,21 +20,6 @@ def advance(state, steps):
         state.update((state.network(x) - x.sum(1, keepdim=True)).square().mean())
 
 
-def test_a_state_saved_in_the_middle_goes_on_bit_for_bit(tmp_path):
-    whole, part = state_of_a_line(), state_of_a_line()
-    advance(whole, 20)
-    advance(part, 7)
-    part.save(tmp_path / "state")
-    resumed = state_of_a_line()
-    resumed.load(tmp_path / "state")
-    advance(resumed, 13)
-    assert resumed.step == 20
-    for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
-        assert torch.equal(a, b)
-    for a, b in zip(whole.average.parameters(), resumed.average.parameters(), strict=True):
-        assert torch.equal(a, b)
-
-
 def test_the_average_lags_behind_the_weights():
     state = state_of_a_line()
     start = [p.clone() for p in state.network.parameters()]

@@ -129,14 +129,6 @@ def test_closing_the_child_ends_a_picture_at_once(stage, monkeypatch):
     assert time.monotonic() - began < drawing_child.CANCEL_PATIENCE_S / 2
 
 
-def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
-    monkeypatch.setenv("FAKE_STEP_S", "0.2")
-    render()
-    began, busy = time.monotonic(), time.thread_time()
-    render_layer(Engine(), bpy.context.evaluated_depsgraph_get())
-    assert time.thread_time() - busy < 0.5 * (time.monotonic() - began)
-
-
 def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "dies")
     with refused(RuntimeError, "Try again, with other programs closed") as caught:

@@ -168,6 +168,10 @@ def test_one_translation_serves_all_frames(tmp_path):
         ({"body_pose": np.zeros((3, 69)), "global_orient": np.zeros((2, 3))}, "global_orient"),
         ({"body_pose": np.ones((3, 23, 3, 3))}, "left_hip"),
         ({"marker_data": np.zeros((3, 72))}, "'marker_data'"),
+        ({"poses": np.full((2, 72), 1e300)}, "bad.npz"),
+        ({"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e300)}, "bad.npz"),
+        ({"poses": np.zeros((2, 72)), "fps": np.array(1e-300)}, "bad.npz"),
+        ({"poses": np.zeros((2, 72)), "fps": np.array(1e9)}, "bad.npz"),
     ],
 )
 def test_arrays_that_are_no_poses_are_named(tmp_path, arrays, name):
@@ -194,18 +198,3 @@ def test_files_that_are_broken_are_named(tmp_path, name, content):
     with refused(FileError, str(tmp_path / name)) as caught:
         read_motion(tmp_path / name)
     assert len(str(caught.value)) < 300
-
-
-@pytest.mark.parametrize(
-    "arrays",
-    [
-        {"poses": np.full((2, 72), 1e300)},
-        {"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e300)},
-        {"poses": np.zeros((2, 72)), "fps": np.array(1e-300)},
-        {"poses": np.zeros((2, 72)), "fps": np.array(1e9)},
-    ],
-)
-def test_numbers_that_cannot_be_a_motion_are_rejected(tmp_path, arrays):
-    np.savez(tmp_path / "motion.npz", **arrays)
-    with pytest.raises(FileError):
-        read_motion(tmp_path / "motion.npz")

@@ -96,19 +96,6 @@ def test_every_custom_property_is_read_by_the_reader_and_tried_by_the_tampering(
     assert {name for _, name, _ in found} == set(HOLDERS)
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["person[MARK]", "person.get(MARK)", "person.get(MARK, '')", "person['primdiffusion_human']",
-     "str(person[MARK])", "person.get('primdiffusion_human')", "person.pop(MARK)"],
-)  # fmt: skip
-def test_the_rule_sees_another_way_to_read(line):
-    from blender_primdiffusion.scene import human
-
-    assert (MARK, "otherwise") in set(uses(ast.parse(line), human))
-    assert (MARK, "reader") in set(uses(ast.parse("stored_record(person, MARK)"), human))
-    assert not list(uses(ast.parse("person[MARK] = 'x'"), human))
-
-
 @pytest.mark.usefixtures("addon")
 def test_every_setting_and_preference_that_is_a_path_is_tried_by_the_tampering():
     def paths(rna: bpy.types.Struct) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...files.arrays import array_names, read_arrays, read_npy
 from ...files.json_files import read_json
 from ...files.regular_files import FileError, read_regular
-from ...files.smpl_pickle import Inert, as_array, load_restricted
+from ...files.smpl_pickle import Stored, as_array, load_restricted
 from ...files.whole_files import atomic_replace
 from .bvh import read_bvh
 from .motion import (
@@ -221,7 +221,7 @@ def _arrays(content: Any, name: str) -> dict[str, NDArray]:
         content = {"pose": content}
     try:
         return {
-            key: as_array(content[key]) if isinstance(content[key], Inert) else np.asarray(content[key])
+            key: as_array(content[key]) if isinstance(content[key], Stored) else np.asarray(content[key])
             for key in POSE_KEYS
             if key in content
         }
@@ -390,5 +390,5 @@ def _of_frames(content: Mapping[Any, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 def _name(key: Any) -> str:
-    text = str(as_array(key)) if isinstance(key, Inert) else str(key)
+    text = str(as_array(key)) if isinstance(key, Stored) else str(key)
     return "".join(letter for letter in text[:40] if letter.isprintable())

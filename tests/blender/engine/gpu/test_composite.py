@@ -139,17 +139,3 @@ def test_bones_in_front_stay_above_the_picture():
     assert seen[:5].all()
     assert seen[11:].all()
     assert seen[10, 10:22].all()
-
-
-def test_bones_in_front_stay_above_a_picture_in_xray():
-    bones = np.array([[[4.0, 8.0], [28.0, 8.0]]])
-    look = ViewLook(PERSPECTIVE, xray=True)
-    seen = shows(drawn(marched(), look, 0.5, before=lambda: keep_bones(bones, SIZE, 2.0, 3.0)))
-    assert not seen[7:9, 4:28].any()
-    assert seen[:5].all()
-
-
-def test_no_bones_change_nothing():
-    assert shows(
-        drawn(marched(), ViewLook(PERSPECTIVE), before=lambda: keep_bones(np.zeros((0, 2, 2)), SIZE, 2, 3))
-    ).all()
