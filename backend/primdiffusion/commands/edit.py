@@ -92,7 +92,7 @@ def _inpaint(request: InpaintRequest, human: Human, session: Session, sampling: 
     model = session.model(request.checkpoint)
     conditioning = (request.attributes, request.guidance)
     with sampling(lambda x0: _decode_inside(model, human, region, x0)) as on_step:
-        return inpaint(model, human, region, request.seed, request.steps, *conditioning, on_step)
+        return inpaint(model, human, region, request.seed, request.steps, *conditioning, on_step, request.masking)
 
 
 def _transfer(request: TransferRequest, human: Human, session: Session, sampling: Sampling) -> Human:

@@ -5,7 +5,7 @@ The primitives outside the region stay bit-identical. Needs no training.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.samplers import Denoise, SamplerStep, gaussian_noise
+from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
 from primdiffusion.editing.edit import (
     OnStep,
@@ -70,6 +70,28 @@ def repaint(
         yield SamplerStep(index, len(moves), t, x0, x)
 
 
+def paste_after_steps(
+    denoise: Denoise,
+    schedule: Schedule,
+    x: Float[Tensor, "b c h w"],
+    known: Float[Tensor, "b c h w"],
+    inside: Bool[Tensor, "h w"],
+    steps: Sequence[int],
+    generator: torch.Generator,
+) -> Iterator[SamplerStep]:
+    """Sample the region `inside` as the released code's mask does (SPEC 3), for comparison with `repaint`.
+
+    A step from level t to t' samples everything (paper eq. 6-7), then pastes q_sample(known, t) outside, which is
+    noisier by one step than the inside; nothing is sampled twice. `x` is used whole, so that the first step sees noise
+    outside. The last x0 equals `known` outside, where the last x keeps the noise of the last step.
+    """
+    for index, (t, t_next) in enumerate(pairwise((*steps, CLEAN))):
+        x0 = denoise(x, t)
+        x = ddpm_step(schedule, x, x0, t, t_next, generator)
+        x = torch.where(inside, x, noised(schedule, known, t, generator))
+        yield SamplerStep(index, len(steps), t, torch.where(inside, x0, known), x)
+
+
 def noised(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: torch.Generator) -> Tensor:
     """Noise clean latents to level t; unchanged for `CLEAN`."""
     if t == CLEAN:
@@ -84,8 +106,13 @@ def renoised(schedule: Schedule, x: Float[Tensor, "b c h w"], t: int, t_up: int,
     return ratio * x + (1 - ratio**2) ** 0.5 * gaussian_noise(x, generator)
 
 
+MaskedSampler = Callable[
+    [Denoise, Schedule, Tensor, Tensor, Tensor, Sequence[int], torch.Generator], Iterator[SamplerStep]
+]
 DRAWS = 64
 """Draws of the person prior to choose a start from."""
+MASKED_SAMPLERS: Mapping[requests.InpaintMethod, MaskedSampler] = {"repaint": repaint, "released": paste_after_steps}
+"""Samplers of a region by name."""
 
 
 @on_fixed_threads
@@ -98,20 +125,24 @@ def inpaint(
     attributes: Mapping[str, str | float] = MappingProxyType({}),
     guidance: float = requests.Conditioning.guidance,
     on_step: OnStep | None = None,
+    masking: requests.InpaintMethod = requests.InpaintRequest.masking,
 ) -> Human:
     """Return the human with the primitives of a region resampled to fit the others (`repaint`).
 
     The region starts from noise. Betas, and the payload outside the region, stay bit-identical: those primitives
     are never decoded. `attributes` condition the region; without any the result is unconditional. Costs nearly
-    2 * `steps` denoiser calls. Deterministic as `human.generate`.
+    2 * `steps` denoiser calls. Deterministic as `human.generate`. With `masking` "released" the sampler is
+    `paste_after_steps`, at `steps` calls.
 
         >>> changed = pd.inpaint(model, human, region, seed=1)
         >>> changed.payload.rgb[~region].equal(human.payload.rgb[~region])
         True
 
     Raises ValueError for a region that is empty, whole or not a mask of K, steps outside 1 ... T, a seed outside
-    0 ... 2^63-1, and unknown attributes.
+    0 ... 2^63-1, unknown attributes and an unknown masking.
     """
+    if masking not in MASKED_SAMPLERS:
+        raise ValueError(f"masking is {masking!r}: choose one of {', '.join(map(repr, MASKED_SAMPLERS))}")
     region = check_region(region)
     if region.all():
         raise ValueError("the region is the whole human: use generate or vary instead")
@@ -121,9 +152,10 @@ def inpaint(
     denoise = conditional_denoiser(model, attributes, guidance)
     known, inside = encoded(model, human), model.cell_mask(region)
     start = start_like(model, known, inside, chain[0], model.condition(attributes), generator)
-    x0 = run_sampler(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
+    sampler = MASKED_SAMPLERS[masking](denoise, model.schedule, start, known, inside, chain, generator)
+    x0 = run_sampler(sampler, on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
-    edit = {**edit, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
+    edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
     return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
 
 

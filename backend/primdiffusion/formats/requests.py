@@ -16,6 +16,7 @@ Sampler = Literal["dpmpp_2m", "ddim", "ddpm"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 Transfer = Literal["texture", "garment"]
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
+InpaintMethod = Literal["repaint", "released"]
 Compositing = Literal["linear", "released"]
 """Appearance of pictures: as in Blender, or as the authors' code draws them."""
 View = Literal["colour", "depth", "alpha", "boxes"]
@@ -220,6 +221,10 @@ class RegionRequest(EditRequest):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class InpaintRequest(RegionRequest, Conditioning):
     """Resample a region of a human so that it fits the rest, for other clothes or hair."""
+
+    masking: InpaintMethod = "repaint"
+    """repaint: the rest is noised to each step's own level, and each step is sampled twice; released: as in the
+    authors' code, the rest is pasted one level too noisy, and each step is sampled once."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

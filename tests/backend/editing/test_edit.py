@@ -52,11 +52,14 @@ def distance(one, two) -> float:
 EDITS = {
     "vary": lambda model, human, **more: vary(model, human, **{"amount": 0.6, "steps": 2, **more}),
     "inpaint": lambda model, human, **more: inpaint(model, human, TOP, **{"steps": 2, **more}),
+    "inpaint_released": lambda model, human, **more: inpaint(
+        model, human, TOP, **{"steps": 2, "masking": "released", **more}
+    ),
     "harmonise": lambda model, human, **more: harmonise(model, human, TOP, **{"amount": 0.6, "steps": 2, **more}),
 }
 
 
-@pytest.mark.parametrize("name", ["inpaint", "harmonise"])
+@pytest.mark.parametrize("name", ["inpaint", "inpaint_released", "harmonise"])
 def test_outside_the_region_nothing_changes_by_a_bit(model, human, name):
     edited = EDITS[name](model, human)
     assert same(edited, human, ~TOP)
@@ -137,6 +140,15 @@ def model_that_must_not_work():
 
     model.denoiser.forward = denoise
     return model
+
+
+def test_masked_sampling_has_two_modes_and_the_file_says_which(human):
+    model = small_model()
+    for masking in ("repaint", "released"):
+        edited = inpaint(model, human, TOP, steps=2, masking=masking)
+        assert edited.provenance["edits"][-1]["masking"] == masking
+    with refused(ValueError, "masking", "none", "repaint", "released"):
+        inpaint(model_that_must_not_work(), human, TOP, masking="none")
 
 
 @pytest.mark.parametrize("amount", [-0.1, 1.1, float("nan")])

@@ -4,7 +4,7 @@ import pytest
 import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
-from primdiffusion.editing.inpaint import noised, renoised, repaint, start_like
+from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint, start_like
 from support.tiny import tiny_model
 
 SCHEDULE = linear()
@@ -48,6 +48,29 @@ def test_what_a_step_leaves_outside_has_the_noise_of_the_level_it_leads_to():
     assert torch.equal(steps[-1].x0[..., ~inside], known[..., ~inside])
 
 
+def test_as_released_the_outside_is_one_step_noisier_than_the_denoiser_is_told():
+    """The known region is pasted at the wrong noise level by one step (SPEC 3), and no step is sampled twice."""
+    known = 3 + 2 * torch.randn(1, 4, 64, 64, generator=generator(1))
+    inside = torch.zeros(64, 64, dtype=torch.bool)
+    inside[:, 40:] = True
+    seen = []
+
+    def denoise(x, t):
+        seen.append((t, x[..., ~inside]))
+        return torch.zeros_like(x)
+
+    chain = trailing_steps(SCHEDULE.length, 12)
+    start = torch.randn(known.shape, generator=generator(2))
+    steps = list(paste_after_steps(denoise, SCHEDULE, start, known, inside, chain, generator(3)))
+    assert [t for t, _ in seen] == chain
+    assert [(step.index, step.total) for step in steps] == [(index, 12) for index in range(12)]
+    assert torch.equal(seen[0][1], start[..., ~inside])
+    for before, (t, outside) in zip(chain, seen[1:], strict=False):
+        added = outside - SCHEDULE.signal(before) * known[..., ~inside]
+        assert float(added.std()) == pytest.approx(SCHEDULE.noise(before), rel=0.03), t
+    assert torch.equal(steps[-1].x0[..., ~inside], known[..., ~inside])
+
+
 def test_noise_added_on_the_way_up_makes_a_sample_of_the_upper_level():
     known = torch.full((1, 8, 64, 64), 2.0)
     x = renoised(SCHEDULE, noised(SCHEDULE, known, 200, generator(1)), 200, 700, generator(2))
@@ -77,8 +100,18 @@ def inside_mean(resamples: int) -> float:
     return float(step.x0[..., 1].mean())
 
 
+def released_inside_mean() -> float:
+    """As `inside_mean`, with the released code's mask."""
+    known = torch.tensor([1.5, 0.0]).expand(20000, 1, 1, 2)
+    start, chain = torch.randn(known.shape, generator=generator(4)), trailing_steps(SCHEDULE.length, 30)
+    denoise = correlated(torch.tensor([[1.0, 0.9], [0.9, 1.0]]))
+    *_, step = paste_after_steps(denoise, SCHEDULE, start, known, torch.tensor([[False, True]]), chain, generator(5))
+    return float(step.x0[..., 1].mean())
+
+
 def test_the_more_often_steps_are_sampled_the_better_the_inside_fits_the_outside():
     fits = 0.9 * 1.5
+    assert fits - released_inside_mean() > fits - inside_mean(2)
     misses = [fits - inside_mean(resamples) for resamples in (1, 2, 5)]
     assert misses[0] > misses[1] > misses[2] > 0
     assert misses[2] < 0.35 * misses[0]
