@@ -33,6 +33,8 @@ TRIM_DISTANCE = 24.0
 """Lab distance from a piece's main colour beyond which a texel is trim."""
 
 
+MOST_LETTERING = 0.5
+"""Share of a piece that lettering and its rim cover at most."""
 RIM = 2
 """Width of the border of an island that is mixed with the background, texels."""
 CREASE_SPREADS, CREASE_DEPTHS = (14, 1), (0.02, 0.02)
@@ -98,7 +100,8 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
             trim |= other
         if kind.smooth:
             near = np.asarray(binary_dilation(other, iterations=RIM), bool)
-            light = np.where(here, _blurred(light, seen & ~near), light)
+            lettering = near[seen].mean() < MOST_LETTERING  # and not stripes, whose mean is the shading
+            light = np.where(here, _blurred(light, seen & ~near if lettering else seen), light)
         for region in (here & ~trim, here & trim):
             if (region & texels.inside).any():
                 middle = np.median(light[region & texels.inside])

@@ -56,7 +56,7 @@ from primdiffusion.runtime.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-METHOD = "fitted 5"
+METHOD = "fitted 6"
 """Method and version stored in files, followed by the checkpoint; those of others are made again."""
 GUESS_LEVEL = 100
 """Step at which the model denoises the mesh's own colours, to make the start of a fit."""
