@@ -33,7 +33,10 @@ from primdiffusion.human import pose_body
 from primdiffusion.reconstruction.posture_fit import Posture, each
 
 _RAISED = ((75.0, -60.0), (-60.0, 75.0))
-_ACROSS = (*((arms, arms) for arms in (0.0, 30.0, 55.0, 75.0)), (55.0, 55.0, 0.0, 96.0), *_RAISED)
+_ACROSS = (
+    *((arms, arms) for arms in (0.0, 30.0, 55.0, 75.0)), (55.0, 55.0, 0.0, 96.0), *_RAISED,
+    *((65.0, 65.0, stride) for stride in (-30.0, 30.0)),
+)  # fmt: skip
 _ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0))
 STANCES: Sequence[tuple[float, Sequence[tuple[float, ...]]]] = (
     (0, _ACROSS), (180, _ACROSS),
