@@ -210,7 +210,7 @@ class PostureFit:
         )[:, 0].clone()  # fmt: skip
         needed = _deviations(start) / NEEDED if tightness > 1 else torch.zeros(6, count)
         self._weights = (1 + needed.square()) ** -2
-        self._weights[-1] = 1  # the height of the camera is a guess
+        self._weights[-1] = self._weights[0]  # a guess of the camera's height does not straighten a bow
 
     @torch.no_grad()
     def posture(self) -> Posture:

@@ -128,7 +128,7 @@ def test_a_camera_is_usual_at_the_height_of_hands():
         ("pelvis", 20, [0, 1, 3, 4]),
         ("spine1", 20, [0]),
         ("left_hip", -20, [1, 2, 3]),
-        ("right_ankle", 20, [4]),
+        ("right_ankle", 20, [2, 4]),
     ],
 )
 def test_a_body_that_leans_or_lifts_a_foot_is_unusual(joint, degrees, kinds):
@@ -147,7 +147,7 @@ def test_who_strides_may_lean_forward():
         forward = axis_angle_to_matrix(torch.tensor([lean, 0.0, 0.0]))
         rotation = torch.cat([upright.joint_rotation[:, :1] @ forward, upright.joint_rotation[:, 1:]], 1)
         found.append(float(deviations(body, BodyPose(rotation, upright.translation), height)[0]))
-    assert found == pytest.approx([3, 0.8], abs=0.15)
+    assert found == pytest.approx([3.1, 0.35], abs=0.1)
 
 
 def test_a_guessed_lens_moves_and_a_stated_one_hardly():
@@ -160,7 +160,7 @@ def test_a_guessed_lens_moves_and_a_stated_one_hardly():
     true = dataclasses.replace(start, camera=dataclasses.replace(camera, intrinsics=wide, world_to_camera=away))
     found = []
     for stated in (False, True):
-        fit = PostureFit(start, STANDARD_SHAPES, stated=[stated])
+        fit = PostureFit(start, STANDARD_SHAPES, tilted=False, stated=[stated])
         fit.refine(PAYLOAD, seen(true), Stage(40, 0.02))
         found.append(float(fit.posture().camera.intrinsics[0, 0, 0] / camera.intrinsics[0, 0, 0]))
     print(found)
