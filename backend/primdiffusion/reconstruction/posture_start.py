@@ -33,10 +33,7 @@ from primdiffusion.human import pose_body
 from primdiffusion.reconstruction.posture_fit import Posture, each
 
 _RAISED = ((75.0, -60.0), (-60.0, 75.0))
-_ACROSS = (
-    *((arms, arms) for arms in (0.0, 30.0, 55.0, 75.0)), (55.0, 55.0, 0.0, 96.0), *_RAISED,
-    *((65.0, 65.0, stride) for stride in (-30.0, 30.0)),
-)  # fmt: skip
+_ACROSS = (*((arms, arms) for arms in (0.0, 30.0, 55.0, 75.0)), (55.0, 55.0, 0.0, 96.0), *_RAISED)
 _ALONG = (*((75.0, 75.0, stride) for stride in (-35.0, -20.0, 0.0, 20.0, 35.0)), (20.0, 20.0))
 STANCES: Sequence[tuple[float, Sequence[tuple[float, ...]]]] = (
     (0, _ACROSS), (180, _ACROSS),
@@ -45,6 +42,8 @@ STANCES: Sequence[tuple[float, Sequence[tuple[float, ...]]]] = (
 """What a standing body may look like: degrees that it is turned to its left, and arguments of `standing`, of which the
 best are tried. From the side, outlines do not tell which arm is raised.
 """
+ALONE = (*_ACROSS, (65.0, 65.0, -30.0), (65.0, 65.0, 30.0))
+"""Stances in a single picture, from the front. Among several, strides let front and back be exchanged."""
 TWIST = 0.4
 """Of an upper arm, by the angle of its elbow, where a hand is at the hip."""
 FRAMING_STEPS = 4
