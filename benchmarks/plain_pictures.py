@@ -178,7 +178,7 @@ def reported(model: DiffusionModel, assets: Assets, count: int) -> dict[str, flo
     kinds, said, overlaps = [*SPOILED, GOOD, GOOD], {True: [], False: []}, []
     with tempfile.TemporaryDirectory() as scratch:
         for number in range(math.ceil(count / len(SPOILED)) * len(kinds)):
-            kind, seed = kinds[number % len(kinds)], OTHERS + number // len(kinds) + number % len(kinds)
+            kind, seed = kinds[number % len(kinds)], OTHERS + number
             path = Path(scratch) / f"{number}.png"
             case = upright.drawn(assets, seed, Path(scratch), turned=180.0 if kind == "behind" else 0.0)
             rgba = np.array(Image.open(case.photograph.path))
@@ -340,7 +340,7 @@ def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Faul
     rotation = torch.cat([turn @ rotation[:1], rotation[1:]])
     pose, betas = BodyPose(rotation[None], torch.zeros(1, 3)), model.shapes.bias.clone()
     camera = framed([photograph], pose, betas, [photograph.lens()])
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False, tilted=True)
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False, tilted=True, stated=[False])
 
 
 def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, seed: int) -> tuple[float, float]:

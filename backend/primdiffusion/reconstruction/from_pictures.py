@@ -28,6 +28,7 @@ from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage,
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, colour_error, quality_of
 from primdiffusion.reconstruction.posture_start import (
+    ALONE,
     STANCES,
     before_cameras,
     cameras_of,
@@ -87,6 +88,8 @@ class Start:
     """Pose and cameras are those of files."""
     tilted: bool
     """See `PostureFit`."""
+    stated: Sequence[bool]
+    """Whether each lens is known, by EXIF or a file of cameras."""
 
 
 class Found(NamedTuple):
@@ -166,6 +169,7 @@ def start_of(
     known = None if pose_path is None else read_posture(pose_path, sizes)
     views = known and known.views if cameras_path is None else read_cameras(cameras_path, sizes)
     tilted = views is None or len(views) == 1  # cameras of several pictures belong together
+    stated = [views is not None or photograph.focal is not None for photograph in photographs]
     if known is None:
         found = [
             _standing(photograph, model, None if views is None else views[i], turned=len(photographs) > 1)
@@ -173,7 +177,7 @@ def start_of(
         ]
         pictures = [i for i, postures in enumerate(found) for _ in postures]
         posture = _together([one for postures in found for one in postures])
-        return Start(posture, pictures, 1.0, complete=False, tilted=tilted)
+        return Start(posture, pictures, 1.0, complete=False, tilted=tilted, stated=[stated[i] for i in pictures])
     pose = repeated(known.pose, len(photographs))
     betas = model.shapes.bias.clone() if known.betas is None else known.betas
     if views is None:
@@ -182,7 +186,8 @@ def start_of(
     else:
         camera = cameras_of(photographs, views)
     posture, pictures = Posture(pose, betas, camera), range(len(photographs))
-    return Start(posture, pictures, POSE_FILE_TIGHTNESS, complete=views is not None, tilted=tilted)
+    complete = views is not None
+    return Start(posture, pictures, POSE_FILE_TIGHTNESS, complete=complete, tilted=tilted, stated=stated)
 
 
 def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, turned: bool) -> list[Posture]:
@@ -192,7 +197,7 @@ def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, 
     back too seldom.
     """
     payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
-    for degrees, stances in STANCES if turned else STANCES[:1]:
+    for degrees, stances in STANCES if turned else ((0, ALONE),):
         tried = []
         for stance in stances:
             pose = standing(*stance, turned=degrees)
@@ -218,7 +223,8 @@ def fit_posture_in(
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PriorFit.of`.
     """
     components, pictures = PriorFit.of(model), list(start.pictures)
-    fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
+    fit = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted, stated=start.stated)
+    people = components.everyone()
 
     def targets(side: int) -> list[PosedView]:
         return _targets([photographs[picture] for picture in pictures], fit.posture(), side)

@@ -40,12 +40,17 @@ TILT_STD = torch.tensor([math.radians(12), 0.0, math.radians(2.5)])
 """Standard deviations of a held camera's pitch, yaw and roll; the body's own yaw stands for that of the camera."""
 HEIGHT_M, HEIGHT_STD_M = 1.5, 0.3
 """Height of a held camera above the floor."""
-LEAN_STD, SIDE_LEAN_STD = math.sin(math.radians(3)), math.sin(math.radians(1.5))
+LEAN_STD, SIDE_LEAN_STD = math.sin(math.radians(2)), math.sin(math.radians(1.5))
 """Standard deviations of a standing torso from the vertical, forward and to the side, where people sway less."""
+STRIDE_M, STRIDE_LEAN = 0.2, math.sin(math.radians(5))
+"""Distance of one ankle before the other at which a torso leans forward or back 1.4 times as much, and the lean of a
+long stride."""
 BALANCE_STD_M = 0.03
 """Standard deviation of the centre of mass from above the line between the feet."""
 SOLE_STD_M = 0.015
 """Standard deviation of the height of one sole above the other."""
+FLAT_STD, LIFTED = math.sin(math.radians(4)), 3.0
+"""Standard deviation of a sole from the level, and the number of them from which a foot is taken to be lifted."""
 _SEGMENTS = (
     ("pelvis", "neck", 0.497, 0.5), ("neck", "head", 0.081, 1.0),
     *((f"{side}_{near}", f"{side}_{far}", mass, share) for side in ("left", "right") for near, far, mass, share in (
@@ -56,10 +61,10 @@ _SEGMENTS = (
 and Motor Control of Human Movement, table 4.1)."""
 
 
-def deviations(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"]) -> Float[Tensor, "4 v"]:
+def deviations(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"]) -> Float[Tensor, "6 v"]:
     """How far poses [v], and cameras at `camera_height` in their worlds (y up), are from the usual, as standard
-    deviations: the torso from the vertical, the centre of mass from above the feet, one sole above the other, and the
-    camera above the floor.
+    deviations: the torso from the vertical, the centre of mass from above the feet, one sole above the other, the left
+    and the right sole from the level, and the camera above the floor.
     """
     world_from_joint = world_from_joints(pose.joint_rotation, body.joints, PARENTS)
     places = world_from_joint[..., :3, 3] + pose.translation[:, None]
@@ -70,11 +75,16 @@ def deviations(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v
     left, right = soles
     torso = torch.nn.functional.normalize(_joint(places, "neck") - _joint(places, "pelvis"), dim=-1)
     (x, z), (left_x, left_z) = torso[:, [0, 2]].T, torch.nn.functional.normalize(world_from_joint[:, 0, [0, 2], 0]).T
-    lean = torch.stack([(left_x * z - left_z * x) / LEAN_STD, (left_x * x + left_z * z) / SIDE_LEAN_STD])
+    ankles = _joint(places, "left_ankle") - _joint(places, "right_ankle")
+    stride = (1 + ((left_x * ankles[:, 2] - left_z * ankles[:, 0]) / STRIDE_M).square()).sqrt()
+    forward = (left_x * z - left_z * x - STRIDE_LEAN * (1 - 1 / stride)) / (LEAN_STD * stride)
+    lean = torch.stack([forward, (left_x * x + left_z * z) / SIDE_LEAN_STD])
+    toes = world_from_joint[:, [JOINT_NAMES.index(f"{side}_ankle") for side in ("left", "right")], 1, 2].T / FLAT_STD
     return torch.stack([
         lean.norm(dim=0),
         _beside_feet(places) / BALANCE_STD_M,
         (left - right) / SOLE_STD_M,
+        *toes / (1 + (toes / LIFTED).square()).sqrt(),
         (camera_height - torch.minimum(left, right) - HEIGHT_M) / HEIGHT_STD_M,
     ])  # fmt: skip
 
@@ -112,11 +122,13 @@ JOINT_STD = torch.tensor(
     [math.radians(_DEGREES[name.removeprefix("left_").removeprefix("right_")]) for name in JOINT_NAMES]
 )
 """Standard deviation of each joint's rotation from the start, radians; the pelvis turns the whole body."""
-SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
-"""Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
+SIDEWAYS_STD_M, DEPTH_STD = 0.05, 0.1
+"""Standard deviations of the position across the line of sight, and of the logarithm of the distance."""
+FOCAL_STD, STATED_FOCAL_STD = 0.35, 0.03
+"""Standard deviations of the logarithm of the focal length, of a guessed and of a stated lens."""
 NEEDED = 3.0
-"""Standard deviations from balance from which the pose of a start is taken to need it: a jump, a seat, a bow. Weights
-fall as those of Geman and McClure."""
+"""Standard deviations from balance from which a known pose is taken to need it: a jump, a seat, a bow. Weights fall as
+those of Geman and McClure."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE, LAST_RATE = 0.15, 0.2
@@ -155,7 +167,7 @@ class Stage:
     blur: float
     """Standard deviation of the blur at the start, as a share of the picture's side; it halves to the end."""
     upright: bool = True
-    """Whether cameras tilt, and how people stand and hold cameras counts; not while limbs are far off."""
+    """Whether lens and tilt are sought, and how people stand and hold cameras counts; not while limbs are far off."""
 
 
 def each(records: Record) -> Iterator[Record]:
@@ -168,10 +180,20 @@ def each(records: Record) -> Iterator[Record]:
 class PostureFit:
     """A posture on its way from where it started."""
 
-    def __init__(self, start: Posture, shapes: ShapePrior, tightness: float = 1.0, *, tilted: bool = True) -> None:
-        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well.
+    def __init__(
+        self,
+        start: Posture,
+        shapes: ShapePrior,
+        tightness: float = 1.0,
+        *,
+        tilted: bool = True,
+        stated: Sequence[bool] = (),
+    ) -> None:
+        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well, so may be
+        off balance.
 
-        `tilted`: pitch, roll and height of the cameras are unknown; otherwise those of the start are true.
+        `tilted`: pitch, roll and height of the cameras are unknown; otherwise those of the start are true. `stated`:
+        whether the lens of each camera is known; none is by default.
         """
         self._start, self._shapes, self._tilted = start, shapes, tilted
         self._joint_std = JOINT_STD[:, None] / tightness
@@ -180,13 +202,15 @@ class PostureFit:
         self._move = torch.zeros(count, 3)
         """Right, down, and the logarithm of the distance."""
         self._lens = torch.zeros(count)
+        self._lens_std = torch.tensor([STATED_FOCAL_STD if one else FOCAL_STD for one in stated or [False] * count])
         self._tilt = torch.zeros(count, 3)
         """Pitch, yaw and roll."""
         self._shape = torch.linalg.solve_triangular(
             shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
         )[:, 0].clone()  # fmt: skip
-        self._weights = (1 + (_deviations(start) / NEEDED).square()) ** -2
-        self._weights[-1] = 1  # the height of the camera is a guess
+        needed = _deviations(start) / NEEDED if tightness > 1 else torch.zeros(6, count)
+        self._weights = (1 + needed.square()) ** -2
+        self._weights[-1] = self._weights[0]  # a guess of the camera's height does not straighten a bow
 
     @torch.no_grad()
     def posture(self) -> Posture:
@@ -201,8 +225,8 @@ class PostureFit:
             start.camera.map(lambda values: values[numbers]),
         )
         self._start = Posture(pose, start.betas, camera)
-        self._turn, self._move, self._lens, self._tilt = (
-            values[numbers] for values in (self._turn, self._move, self._lens, self._tilt)
+        self._turn, self._move, self._lens, self._lens_std, self._tilt = (
+            values[numbers] for values in (self._turn, self._move, self._lens, self._lens_std, self._tilt)
         )
         self._weights = self._weights[:, numbers]
 
@@ -222,7 +246,8 @@ class PostureFit:
         `on_step` is called after each step; an exception that it raises cancels. `shaped`: betas move too.
         """
         upright = self._tilted and stage.upright
-        unknowns = [self._turn, self._move, self._lens, *[self._shape] * shaped, *[self._tilt] * upright]
+        others = [self._move, *[self._lens] * stage.upright, *[self._shape] * shaped, *[self._tilt] * upright]
+        unknowns = [self._turn, *others]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
         payloads = [payload] * len(targets) if isinstance(payload, Payload) else payload
@@ -235,7 +260,8 @@ class PostureFit:
             posture = self._posture()
             seen = zip(posture.frames(), payloads, each(resized(posture.camera, scale, first)), pictures, strict=True)
             errors = [_difference(*one, blur) for one in seen]
-            prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
+            priors = [self._turned() / self._joint_std, *others]
+            prior = torch.cat([value.flatten() for value in priors]).square().sum() / 2
             if upright:
                 prior = prior + (self._weights * _deviations(posture).square()).sum() / 2
             loss = EVIDENCE * torch.stack(errors).sum() + prior
@@ -245,22 +271,29 @@ class PostureFit:
         for value in unknowns:
             value.requires_grad_(False)
 
+    def _turned(self) -> Float[Tensor, "v 24 3"]:
+        """Turns of the joints, radians. A body turns with its camera, so that a tilt hardly changes the picture."""
+        start = self._start
+        tilt = (TILT_STD * self._tilt)[:, None] @ start.camera.world_to_camera[:, :, :3]
+        turn = self._turn * self._joint_std
+        return torch.cat([turn[:, :1] - tilt @ start.pose.joint_rotation[:, 0], turn[:, 1:]], 1)
+
     def _posture(self) -> Posture:
-        start, log_focal, log_depth = self._start, FOCAL_STD * self._lens, DEPTH_STD * self._move[:, 2]
+        start, log_focal, log_depth = self._start, self._lens_std * self._lens, DEPTH_STD * self._move[:, 2]
         extrinsics = start.camera.world_to_camera
         pelvis = default_body().shape(start.betas).joints[0] + start.pose.translation
         before = (extrinsics[:, :, :3] @ pelvis[:, :, None])[..., 0] + extrinsics[:, :, 3]
         # A longer lens from farther away shows the same size, which separates focal length from distance.
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
-        # A tilted camera stays where it is. The body moves to the same place in the picture, but keeps its own lean.
+        # A tilted camera stays where it is, and the body moves to the same place in the picture.
         turn = axis_angle_to_matrix(TILT_STD * self._tilt)
         translation = (turn @ extrinsics[:, :, 3:])[..., 0]
         extrinsics = torch.cat([turn @ extrinsics[:, :, :3], translation[..., None]], -1)
         pelvis = ((place - translation)[:, None] @ extrinsics[:, :, :3])[:, 0]
         limit = torch.maximum(self._shapes.limit, start.betas.abs())
         betas = (self._shapes.bias + self._shapes.scale @ self._shape).clamp(-limit, limit)
-        rotation = start.pose.joint_rotation @ axis_angle_to_matrix(self._turn * self._joint_std)
+        rotation = start.pose.joint_rotation @ axis_angle_to_matrix(self._turned())
         pose = BodyPose(rotation, pelvis - default_body().shape(betas).joints[0])
         focal = start.camera.intrinsics[..., :2] * log_focal.exp()[:, None, None]
         intrinsics = torch.cat([focal, start.camera.intrinsics[..., 2:]], -1)
@@ -268,7 +301,7 @@ class PostureFit:
         return Posture(pose, betas, camera)
 
 
-def _deviations(posture: Posture) -> Float[Tensor, "4 v"]:
+def _deviations(posture: Posture) -> Float[Tensor, "6 v"]:
     return deviations(default_body().shape(posture.betas), posture.pose, posture.camera.position[:, 1])
 
 
