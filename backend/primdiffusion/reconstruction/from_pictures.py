@@ -28,7 +28,6 @@ from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage,
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
 from primdiffusion.reconstruction.posture_quality import FitQuality, colour_error, quality_of
 from primdiffusion.reconstruction.posture_start import (
-    ALONE,
     STANCES,
     before_cameras,
     cameras_of,
@@ -197,7 +196,7 @@ def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, 
     back too seldom.
     """
     payload, betas, found = _mean_human(model), model.shapes.bias.clone(), []
-    for degrees, stances in STANCES if turned else ((0, ALONE),):
+    for degrees, stances in STANCES if turned else STANCES[:1]:
         tried = []
         for stance in stances:
             pose = standing(*stance, turned=degrees)

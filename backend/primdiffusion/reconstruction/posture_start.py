@@ -42,8 +42,6 @@ STANCES: Sequence[tuple[float, Sequence[tuple[float, ...]]]] = (
 """What a standing body may look like: degrees that it is turned to its left, and arguments of `standing`, of which the
 best are tried. From the side, outlines do not tell which arm is raised.
 """
-ALONE = (*_ACROSS, (65.0, 65.0, -30.0), (65.0, 65.0, 30.0))
-"""Stances in a single picture, from the front. Among several, strides let front and back be exchanged."""
 TWIST = 0.4
 """Of an upper arm, by the angle of its elbow, where a hand is at the hip."""
 FRAMING_STEPS = 4
