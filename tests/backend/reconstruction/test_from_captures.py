@@ -10,7 +10,7 @@ from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import sample
-from primdiffusion.diffusion.surfaces import Surfaces
+from primdiffusion.diffusion.surfaces import Surfaces, without_faces_and_skirts
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.image import encode_srgb
@@ -77,7 +77,7 @@ def test_unseen_sides_have_surfaces_of_one_colour(plain):
         torch.zeros(1, MODEL.vocabulary.width), torch.tensor([False]), torch.zeros(2, dtype=torch.int64),
         torch.cat([front, back]), ones,
         torch.stack([ones[0], 0.5 * ones[0]]), torch.tensor([True, False]), torch.tensor([False, True]),
-        *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0],
+        *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0], **without_faces_and_skirts(),
     )  # fmt: skip
     person, free, _ = plain
     found = reconstruct(dataclasses.replace(MODEL, surfaces=surfaces), person)
