@@ -309,6 +309,34 @@ def test_skirts_are_as_dense_and_as_large_as_those_of_all_people(surfaces):
     assert torch.equal(other[:, 3 * S**3 :], torn[1, :, 3 * S**3 :])
 
 
+def test_cloth_between_the_legs_hides_them_and_is_as_dense_as_on_most_people(codec):
+    generator = torch.Generator().manual_seed(9)
+    between = (box_sizes("blouse and skirt") != 1).any(1).nonzero()[:, 0]
+    known = {"outfit": "blouse and skirt", "pattern": "plain", "hair": "short", "hat": "none"}
+    cells, dense = [], torch.rand(GEOMETRIES, generator=generator)
+    for geometry in range(GEOMETRIES):
+        for _ in range(COLOURINGS):
+            colours = some_colours(generator)
+            voxels = voxels_of(dressed("short", colours, generator, outfit=known["outfit"])).clone()
+            voxels[between, INNER, :3] = colours["skin"]
+            voxels[between, OUTER, :3] = 0.6 * colours["trousers"] + 0.4 * torch.rand(
+                len(between), 1, 3, generator=generator
+            )
+            voxels[between, :, 3] = dense[geometry]
+            cells.append(torch.nn.functional.pad(voxels.mT.flatten(1), (0, 3), value=SCALE_VALUE))
+    latents, geometry = codec.encode(torch.stack(cells)), torch.arange(GEOMETRIES).repeat_interleave(COLOURINGS)
+    condition = WORDS.encode(known).expand(len(latents), -1)
+    people = LatentSet(latents.half(), geometry, torch.zeros(GEOMETRIES, 10), condition, torch.tensor(len(latents)))
+    found = fit_surfaces(people, codec, WORDS, PriorConfig())
+    wanted = dense.repeat_interleave(COLOURINGS).quantile(0.9)
+    torch.testing.assert_close(found.dense, wanted.expand_as(found.dense), atol=0.01, rtol=0)
+    hidden = torch.zeros(K, S**3)
+    for surface in (~found.natural).nonzero()[:, 0]:
+        own = found.surface == surface
+        hidden[found.cell[own]] = torch.maximum(hidden[found.cell[own]], found.share[own])
+    assert float(hidden[between][:, FAR_OUT].min()) > 0.95
+
+
 @pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {}])
 def test_people_without_known_surfaces_stay_as_they_are(surfaces, known):
     cells = torch.rand(1, K, VALUES)
