@@ -42,6 +42,8 @@ EVEN, MOST_BOXES = 0.04, 0.75
 """Difference from the garment's colour that so many of its boxes stay below, on plain people."""
 EXPLAINED = 0.5
 """Share of the variance of a garment's colours that its prints explain together, or it has another one."""
+OPAQUE = 5.0
+"""Optical depth of a layer of full voxels: about 1.3 in each of the four boxes that overlap."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,5 +229,9 @@ def voxels_of(cells: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 512 4"]:
 
 
 def seen(voxels: Float[Tensor, "*b 512 4"]) -> Float[Tensor, "*b 512"]:
-    """How much each voxel counts for the colour of its box: as dense as it is, and as the marcher's window shows it."""
-    return voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()
+    """How much each voxel counts for the colour of its box: as dense as it is, as the marcher's window shows it, and as
+    little as denser layers hide it from outside. Fits leave other colours below a surface."""
+    weight = voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()
+    layers = weight.unflatten(-1, (S, S, S))  # from the body outwards
+    above = layers.flip(-3).cumsum(-3).flip(-3) - layers
+    return (layers * torch.exp(-OPAQUE * above)).flatten(-3)

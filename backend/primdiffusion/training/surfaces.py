@@ -14,7 +14,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
@@ -29,27 +28,33 @@ from primdiffusion.diffusion.surfaces import (
 )
 from primdiffusion.editing.regions import region_of
 from primdiffusion.people.skirts import box_sizes
-from primdiffusion.primitives.primitives import GRID, K, S
+from primdiffusion.primitives.primitives import K, S
+from primdiffusion.training.box_colours import (
+    CHUNK,
+    COVERED,
+    DARKEST,
+    PASSES,
+    UNEVEN,
+    Meeting,
+    covered_by,
+    largest_part,
+    mean_colour,
+    normal_equations,
+    smooth,
+    surrounded,
+    tones_of,
+    unexplained_share,
+)
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.prints import FEWEST_GEOMETRIES, Print, find_prints
 
-PASSES = 3
-"""Regressions, each on the colour of what the former found."""
-CHUNK = 16
-"""People whose voxels are in memory at once."""
 NO_HAIR, ALL_HAIR = 0.4, 0.8
 """Slopes of a voxel's colour on the hair's, as shares of its tone: below is no hair, above all of it is."""
-DARKEST = 0.5
-"""Tones below this count as this: chance is large beside a dark voxel's colour."""
 FEWEST_VOXELS, SOLID = 8, 0.3
 """Voxels of hair, as dense as that, in a box; fewer are chance."""
 BALD = 0.3
 """Share of the variance of hair that is not the skin's; with less the head is bald."""
-COVERED, OTHERS = 0.85, 0.3
-"""Least slope of a box's colour on the surface's, as a share of its tone, and largest slopes on other colours."""
-UNEVEN = 0.04
-"""Largest rms difference between a box's colour and its tone of the surface's."""
 UNEVEN_GARMENT = 0.0136
 """The same in the median over a garment's boxes: more are prints and fades, which plain garments may have too."""
 SMALL, UNEVEN_SMALL = 80, 0.03
@@ -64,10 +69,6 @@ NO_CLOTH, ALL_CLOTH = 0.1, 0.43
 """Shares of a garment between the legs, below which there is none, and above which it hides all else."""
 DENSE = 0.9
 """Quantile of people whose cloth between the legs is less dense."""
-SURROUNDED = 0.7
-"""Share of a box and its neighbours that a garment covers, above which the box is the garment's too."""
-FEWEST_BOXES = 24
-"""Of a garment, or of skin: socks and collars are too few to tell from chance."""
 
 
 class _Rows(NamedTuple):
@@ -166,7 +167,7 @@ class _People:
         for hair in vocabulary.categories.get(config.hair, ()):
             if hair in config.hanging:
                 self.hanging |= self.condition @ vocabulary.encode({config.hair: hair}) > 0
-        self.boxes = torch.cat([_mean(voxels, seen(voxels)) for voxels in self.voxels(torch.arange(count))])
+        self.boxes = torch.cat([mean_colour(voxels, seen(voxels)) for voxels in self.voxels(torch.arange(count))])
         self.skin = torch.full((count, 3), torch.nan)
         """The colour of faces, where it is known."""
 
@@ -205,23 +206,24 @@ class _People:
         if not len(own):
             return []
         beside = [boxes[:, region_of((name,))].mean(1) for name in ("torso", "hips")]
-        skin = _covered(boxes, region_of(("hands",)), beside, ~region_of(("hair",)))
+        skin = covered_by(boxes, region_of(("hands",)), beside, ~region_of(("hair",)))
         if skin is None or not (skin & face).any():
             return []
-        skin &= ~between  # in fits of a skirt, the insides of the legs are hidden
         of_skin = self.rows(own, skin, read=face, drawn=~face)
         self.skin[own] = boxes[:, skin & face].mean(1)
         whoever, everyone = row, own
         row, own = self.with_all({**attributes, **plain}, hanging=False)
         patterned = everyone[~torch.isin(everyone, own)]
         boxes, parts, left = self.boxes[own], [skin & face], ~skin & ~region_of(("face", "hair", "hands"))
-        while len(own) and (start := _largest(boxes, left)) is not None:
-            garment = _covered(boxes, start, [boxes[:, part].mean(1) for part in parts], left)
+        while len(own) and (start := largest_part(boxes, left)) is not None:
+            garment = covered_by(boxes, start, [boxes[:, part].mean(1) for part in parts], left)
             if garment is not None:
-                garment |= _surrounded(garment) & left
+                garment |= surrounded(garment) & left
                 parts.append(garment)
             left &= ~(start if garment is None else start | garment)
-        parts = [parts[0], *(part for part in parts[1:] if self.even(own, part))]
+        for part in parts[1:]:
+            if self.unevenness(own, part) > (UNEVEN_SMALL if part.sum() < SMALL else UNEVEN_GARMENT):
+                parts = [each for each in parts if each is not part]
         if len(parts) == 1:
             return [_Surface(whoever, of_skin, natural=True)]
         meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
@@ -230,7 +232,7 @@ class _People:
             bare = part is parts[0]
             whole = of_skin if bare else self.rows(own, part, read=everywhere, drawn=everywhere)
             rows = _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))
-            if bare or (len(patterned) and self.even(patterned, part)):  # the pattern is another garment's
+            if bare or (len(patterned) and self.unevenness(patterned, part) < UNEVEN):  # patterned elsewhere
                 found.append(_Surface(whoever, rows, natural=bare))
                 continue
             found.append(_Surface(row, rows))
@@ -265,10 +267,9 @@ class _People:
         dense = torch.cat([voxels[:, between, :, 3].clamp(0, 1) for voxels in self.voxels(own)]).quantile(DENSE, dim=0)
         return _Skirt(torch.full_like(between, surface), between, dense, sizes[between])
 
-    def even(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> bool:
-        """Whether it has one colour on these people."""
-        most = UNEVEN_SMALL if garment.sum() < SMALL else UNEVEN_GARMENT
-        return bool(_tones(self.boxes[people], garment)[1][garment].median() < most)
+    def unevenness(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> float:
+        """Median over its boxes of the rms difference from one colour on these people."""
+        return float(tones_of(self.boxes[people], garment)[1][garment].median())
 
     def prints(self, garment: _Surface) -> list[Print]:
         """Prints on a garment of patterned people."""
@@ -307,12 +308,12 @@ class _People:
         cells = meet.nonzero()[:, 0]
         number = self.geometry[own].unique(return_inverse=True)[1]
         one, other = (
-            _Meeting.of([self.boxes[half][:, part].mean(1) for part in parts], self.voxels(half), meet)
+            Meeting.of([self.boxes[half][:, part].mean(1) for part in parts], self.voxels(half), meet)
             for half in (own[number % 2 == 0], own[number % 2 == 1])
         )
         error, spread = ((a + b) / 2 for a, b in zip(one.tested(other), other.tested(one), strict=True))
         explained = (error < UNEXPLAINED * spread) & (error.sqrt() < UNEVEN_BORDER)
-        both = _Meeting(*(a + b for a, b in zip(one, other, strict=True)))
+        both = Meeting(*(a + b for a, b in zip(one, other, strict=True)))
         parts_of, tone = both.fitted()
         weight = both.seen / both.seen.sum(1, keepdim=True).clamp_min(1e-6)
         explained &= (parts_of * weight[..., None]).sum(1).amax(1) < COVERED
@@ -349,15 +350,15 @@ class _People:
         cells = (part | below if hanging else part).nonzero()[:, 0]
         on_part = part[cells]
         colour, beside = (self.boxes[own][:, region_of((name,))].mean(1) for name in where[1:])
-        if _left_of(colour, beside) < BALD:
+        if unexplained_share(colour, beside) < BALD:
             return []
         share = torch.zeros(len(cells), S**3)
         for number in range(PASSES):
             if number:
                 sure = (share[on_part] - SURELY).clamp_min(0)
                 of_part = (voxels[:, cells[on_part]] for voxels in self.voxels(own))
-                colour = torch.cat([_mean(v.flatten(1, 2), (sure * seen(v)).flatten(1)) for v in of_part])
-            normal, design = _normal([colour, beside])
+                colour = torch.cat([mean_colour(v.flatten(1, 2), (sure * seen(v)).flatten(1)) for v in of_part])
+            normal, design = normal_equations([colour, beside])
             by_design, by_colour, density = (torch.zeros(len(cells), S**3, *size) for size in ((2,), (), ()))
             for x, some, voxels in zip(design.split(CHUNK), colour.split(CHUNK), self.voxels(own), strict=True):
                 by_design += torch.einsum("ncq,nkvc->kvq", x, voxels[:, cells, :, :3])
@@ -365,7 +366,7 @@ class _People:
                 density += voxels[:, cells, :, 3].sum(0) / len(own)
             tone = (by_colour / colour.square().sum().clamp_min(1e-6)).clamp(0, BRIGHTEST)
             slope = torch.linalg.solve(normal, by_design[..., None])[..., 0, 0]
-            slope = _smooth(slope) / _smooth(tone).clamp(DARKEST, 1)
+            slope = smooth(slope) / smooth(tone).clamp(DARKEST, 1)
             share = ((slope - NO_HAIR) / (ALL_HAIR - NO_HAIR)).clamp(0, 1)
             share *= (((share > 0.5) & (density > SOLID)).sum(1) >= FEWEST_VOXELS)[:, None]
             if not share[on_part].any():
@@ -374,127 +375,3 @@ class _People:
         tone = tone * (share > 0)
         rows = _Rows(cells[kept], share[kept], tone[kept], on_part[kept], torch.ones_like(on_part[kept]))
         return [_Surface(row, rows)]
-
-
-class _Meeting(NamedTuple):
-    """Sums over people of boxes where surfaces meet: voxels, their colours as mixtures of those of Q surfaces."""
-
-    normal: Float[Tensor, "q q"]
-    by_design: Float[Tensor, "k 512 q"]
-    total: Float[Tensor, "k 512 3"]
-    square: Float[Tensor, "k 512"]
-    seen: Float[Tensor, "k 512"]
-    people: Int[Tensor, ""]
-
-    @classmethod
-    def of(
-        cls,
-        colours: Sequence[Float[Tensor, "n 3"]],
-        people: Iterator[Float[Tensor, "m 1024 512 4"]],
-        cells: Bool[Tensor, "k"],
-    ) -> _Meeting:
-        normal, design = _normal(colours, centred=False)
-        parts = []
-        for x, voxels in zip(design.split(CHUNK), people, strict=True):
-            rgb = voxels[:, cells, :, :3]
-            by_design = torch.einsum("ncq,nkvc->kvq", x, rgb)
-            parts.append((by_design, rgb.sum(0), rgb.square().sum((0, 3)), seen(voxels[:, cells]).sum(0)))
-        by_design, total, square, weight = (torch.stack(each).sum(0) for each in zip(*parts, strict=True))
-        return cls(normal, by_design, total, square, weight, torch.tensor(len(design)))
-
-    def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
-        """How much of a voxel each surface is, and its tone."""
-        slopes = torch.linalg.solve(self.normal, self.by_design[..., None])[..., 0].clamp_min(0)
-        slopes = torch.stack([_smooth(slope) for slope in slopes.unbind(-1)], dim=-1)
-        shares = slopes / slopes.sum(-1, keepdim=True).clamp_min(1e-6)
-        along, power = self._products(shares)
-        return shares, (along / power).clamp(0, BRIGHTEST)
-
-    def tested(self, other: _Meeting) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-        """Mean squares over each box of what the fit to others leaves, and of differences between people."""
-        shares, tone = other.fitted()
-        along, power = self._products(shares)
-        error = self.square - 2 * tone * along + tone.square() * power
-        spread = self.square - self.total.square().sum(-1) / self.people
-        weight = self.seen / (3 * self.people * self.seen.sum(1, keepdim=True).clamp_min(1e-6))
-        return (error * weight).sum(1), (spread * weight).sum(1)
-
-    def _products(self, shares: Float[Tensor, "k 512 q"]) -> tuple[Float[Tensor, "k 512"], Float[Tensor, "k 512"]]:
-        """Of mixtures with the voxels, and with themselves."""
-        power = torch.einsum("kvq,qr,kvr->kv", shares, self.normal, shares)
-        return (shares * self.by_design).sum(-1), power.clamp_min(1e-6)
-
-
-def _mean(voxels: Float[Tensor, "*b v 4"], weight: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 3"]:
-    """Mean colour of voxels."""
-    total = (voxels[..., :3] * weight[..., None]).sum(-2)
-    return total / weight.sum(-1, keepdim=True).clamp_min(1e-6)
-
-
-def _normal(
-    colours: Sequence[Float[Tensor, "n 3"]], centred: bool = True
-) -> tuple[Float[Tensor, "q q"], Float[Tensor, "n 3 q"]]:
-    """The normal matrix of a regression on colours, with the same slope for red, green and blue, and its design."""
-    design = torch.stack([colour - colour.mean(0) if centred else colour for colour in colours], dim=-1)
-    return torch.einsum("ncq,ncr->qr", design, design) + 1e-2 * torch.eye(len(colours)), design
-
-
-def _slopes(values: Float[Tensor, "n k 3"], colours: Sequence[Float[Tensor, "n 3"]]) -> Float[Tensor, "k q"]:
-    normal, design = _normal(colours)
-    return torch.linalg.solve(normal, torch.einsum("ncq,nkc->kq", design, values)[..., None])[..., 0]
-
-
-def _tones(boxes: Float[Tensor, "n k 3"], part: Bool[Tensor, "k"]) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-    """Tones of boxes of a part's colour, and rms differences from them."""
-    colour = boxes[:, part].mean(1)
-    tone = torch.einsum("nc,nkc->k", colour, boxes) / colour.square().sum().clamp_min(1e-6)
-    return tone, (boxes - tone[:, None] * colour[:, None]).square().mean((0, 2)).sqrt()
-
-
-def _covered(
-    boxes: Float[Tensor, "n k 3"],
-    start: Bool[Tensor, "k"],
-    others: Sequence[Float[Tensor, "n 3"]],
-    within: Bool[Tensor, "k"],
-) -> Bool[Tensor, "k"] | None:
-    """The boxes `within` that follow the colour of those of the start, and no other; None if they are few."""
-    covered = start
-    for _ in range(PASSES):
-        tone, uneven = _tones(boxes, covered)
-        slope, by_others = _slopes(boxes, [boxes[:, covered].mean(1), *others]).split([1, len(others)], dim=-1)
-        covered = (slope[:, 0] / tone.clamp(DARKEST, 1 / DARKEST) > COVERED) & (uneven < UNEVEN) & within
-        covered &= (by_others.abs() < OTHERS).all(-1)
-        if covered.sum() < FEWEST_BOXES:
-            return None
-    return covered
-
-
-def _surrounded(part: Bool[Tensor, "k"]) -> Bool[Tensor, "k"]:
-    """Boxes nearly all of whose neighbours on the grid are in the part: holes, where a few people wear a badge."""
-    around = functional.avg_pool2d(part.float().view(1, GRID, GRID), 3, stride=1, padding=1)
-    return around.flatten() > SURROUNDED
-
-
-def _largest(boxes: Float[Tensor, "n k 3"], left: Bool[Tensor, "k"]) -> Bool[Tensor, "k"] | None:
-    """The most boxes among those left that have the tones of one of them; None if they are few."""
-    of_boxes = boxes[:, left].transpose(0, 1).flatten(1)
-    products = of_boxes @ of_boxes.T
-    tone = products / products.diagonal().clamp_min(1e-6)
-    uneven = ((products.diagonal()[:, None] - tone * products).clamp_min(0) / of_boxes.shape[1]).sqrt()
-    alike = (uneven < UNEVEN) & (tone > DARKEST) & (tone < 1 / DARKEST)
-    if not len(alike) or alike.sum(0).max() < FEWEST_BOXES:
-        return None
-    return torch.zeros_like(left).masked_scatter(left, alike[:, alike.sum(0).argmax()])
-
-
-def _left_of(colour: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> float:
-    """Share of a colour's variance that another one does not explain."""
-    centred, design = colour - colour.mean(0), other - other.mean(0)
-    slope = (centred * design).sum() / design.square().sum().clamp_min(1e-6)
-    return float((centred - slope * design).square().sum() / centred.square().sum().clamp_min(1e-6))
-
-
-def _smooth(values: Float[Tensor, "c 512"]) -> Float[Tensor, "c 512"]:
-    """Means over neighbouring voxels of each box: the slope of one voxel is noisy."""
-    boxes = functional.pad(values.view(-1, 1, S, S, S), (1,) * 6, mode="replicate")
-    return functional.avg_pool3d(boxes, 3, stride=1).view_as(values)
