@@ -47,7 +47,7 @@ class Backdrop:
     """The rasterised solids of an image."""
 
     solids: Image
-    """At FINER times the image resolution."""
+    """Image of the solids, at FINER times the resolution."""
     hole: Bool[ndarray, "fh fw"]
     """Samples that hit a holdout, at the same resolution."""
     end: Float32[ndarray, "h w"]

@@ -58,7 +58,7 @@ class Human(TensorRecord):
     betas: Float[Tensor, "n"]
     """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
-    """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
+    """Origin of the human; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
     sample, attributes and guidance if requested, `unfollowed` (the values that it shows instead of requested ones,
     `diffusion.model`), checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
@@ -131,7 +131,7 @@ def generate_batch(
     if model.vocabulary.width:
         conditioning["guidance"] = guidance
     ending = {} if end == CLEAN else {"end": end}
-    shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
+    shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **model_provenance(model)}
     people = decode_humans(model, final, seeds, attributes)
     missed = ({"unfollowed": names} if names else {} for names in unfollowed(model, final, attributes))
     return [
@@ -158,7 +158,7 @@ def decode_humans(
     return people
 
 
-def made_by(model: DiffusionModel) -> dict[str, Any]:
+def model_provenance(model: DiffusionModel) -> dict[str, Any]:
     """The provenance entries that describe the model and the program version."""
     of_file = {"checkpoint_sha256": model.card["sha256"]} if "sha256" in model.card else {}
     return {

@@ -39,7 +39,7 @@ SAME_BODY_M = 0.02
 LEAST_COVERED = 0.8
 """Fraction of the body inside the masks; dressed humans on the default body have more than 0.95."""
 _EACH = 20
-"""One in this many vertices of the body is projected."""
+"""Step between the vertices of the body that are projected."""
 _NAMED = 3
 
 
@@ -62,7 +62,7 @@ class CapturedPerson:
     whole_views: tuple[View, ...] = ()
     """Cameras of plain pictures, as found; those of `views` see squares cut out of them."""
     fit: Mapping[str, Any] | None = None
-    """How well the posture explains plain pictures, as posture.json holds it: `FitQuality.content`."""
+    """Quality of the posture in plain pictures, as posture.json holds it: `FitQuality.content`."""
     masks_made: tuple[UInt8[np.ndarray, "H W"], ...] = ()
     """Masks of whole pictures that had none, of upright pixels."""
 

@@ -32,7 +32,7 @@ from primdiffusion.editing.edit import (
 )
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.formats import requests
-from primdiffusion.human import Human, made_by
+from primdiffusion.human import Human, model_provenance
 from primdiffusion.runtime.device import on_fixed_threads
 
 RESAMPLES = 2
@@ -155,7 +155,7 @@ def inpaint(
     sampler = MASKED_SAMPLERS[masking](denoise, model.schedule, start, known, inside, chain, generator)
     x0 = run_sampler(sampler, on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
-    edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
+    edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **model_provenance(model)}
     return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
 
 
@@ -213,4 +213,4 @@ def harmonise(
         "seed": seed,
         "steps": steps,
     }
-    return with_edit(human, {**edit, **made_by(model)}, payload)
+    return with_edit(human, {**edit, **model_provenance(model)}, payload)

@@ -26,7 +26,7 @@ from primdiffusion.editing.edit import (
     with_edit,
 )
 from primdiffusion.formats import requests
-from primdiffusion.human import Human, made_by
+from primdiffusion.human import Human, model_provenance
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.runtime.device import on_fixed_threads
 
@@ -67,7 +67,7 @@ def interpolate(
     near, far = (a, b) if fraction <= 0.5 else (b, a)
     edit = {"edit": "interpolate", "with": dict(far.provenance), "fraction": min(fraction, 1 - fraction)}
     betas = torch.lerp(a.betas.cpu(), b.betas.cpu(), fraction)
-    return with_edit(near, {**edit, "steps": steps, **made_by(model)}, payload, betas)
+    return with_edit(near, {**edit, "steps": steps, **model_provenance(model)}, payload, betas)
 
 
 def inversion_steps(schedule: Schedule, steps: int) -> list[int]:

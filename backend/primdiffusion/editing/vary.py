@@ -24,7 +24,7 @@ from primdiffusion.editing.edit import (
     with_edit,
 )
 from primdiffusion.formats import requests
-from primdiffusion.human import Human, made_by
+from primdiffusion.human import Human, model_provenance
 from primdiffusion.runtime.device import on_fixed_threads
 
 
@@ -84,7 +84,7 @@ def vary_batch(
         payloads = [added(decoded(model, one[None]), residual, signal) for one in varied]
         missed = [{"unfollowed": names} if names else {} for names in unfollowed(model, varied, attributes)]
     edit = {"edit": "vary", "amount": amount}
-    shared = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
+    shared = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **model_provenance(model)}
     return [
         with_edit(human, {**edit, "seed": seed, **shared, **names}, payload)
         for seed, payload, names in zip(seeds, payloads, missed, strict=True)

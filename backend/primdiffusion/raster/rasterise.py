@@ -72,7 +72,7 @@ class Figure:
     """A mesh prepared for rendering in many poses: what does not depend on the pose, all parts concatenated."""
 
     mesh: TexturedMesh
-    """In the rest pose."""
+    """Mesh in the rest pose."""
     soup: TriangleSoup
     """Its triangles in the rest pose."""
     joint: UInt8[np.ndarray, "F"]

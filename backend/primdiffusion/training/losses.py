@@ -69,7 +69,7 @@ class RestObjective:
         """Draw noisy people; return their rest, guessed coefficients, step, condition and clean rest."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
-        weights, indices = blends(self.people, len(t), self.config.blend, generator)
+        weights, indices = blends(self.people, len(t), self.config.blend_fraction, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5

@@ -52,7 +52,7 @@ class Kind(NamedTuple):
     """A group, a head and features that go together."""
 
     share: float
-    """Its share of people."""
+    """Share of people in the group."""
     choices: tuple[int, ...]
     """The number of its choice of each key."""
 
@@ -76,8 +76,8 @@ def fit_mixture(
     skin, skin_of_head, remainder = _skin(remainder, clothes, groups, inside, config)
     bare = _bare(heads, vocabulary, config)[heads.of_person]
     of_bare = groups._replace(of_person=groups.of_person[bare])
-    axes = _axes(_covariances(remainder[bare, :clothes], of_bare, config.outfit, config.lean), config.axes)
-    head_axes = _axes(_covariances(remainder[:, clothes:], heads, config.hair, config.lean), config.axes)
+    axes = _axes(_covariances(remainder[bare, :clothes], of_bare, config.outfit, config.shrinkage), config.axes)
+    head_axes = _axes(_covariances(remainder[:, clothes:], heads, config.hair, config.shrinkage), config.axes)
     return {
         "axes": axes[0], "variance": axes[1], "left": axes[2],
         "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
@@ -172,13 +172,13 @@ def _bare(heads: Key, vocabulary: AttributeVocabulary, config: PriorConfig) -> B
     return bare | ~bare.any()
 
 
-def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> list[Float[Tensor, "i i"]]:
+def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, shrinkage: float) -> list[Float[Tensor, "i i"]]:
     """Covariance of each choice's people: that of their colours and that of details.
 
     Colours are the leading principal directions of all people who have the same of `worn`, whatever their sex; few
     patterned people have those of many plain ones, but do not lend them their prints. Of details, which are what
-    colours leave, `lean` people are those of all choices alike in the last attribute: their colours would be sleeves
-    that differ from the shirt.
+    colours leave, `shrinkage` people are those of all choices alike in the last attribute: their colours would be
+    sleeves that differ from the shirt.
     """
     if not len(c):
         return [torch.zeros(c.shape[1], c.shape[1]) for _ in key.choices]
@@ -195,7 +195,7 @@ def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> l
     scatter = torch.stack([(detail * own[:, None]).T @ detail for own in members])
     covariances = []
     for g, colour in enumerate(colours):
-        share = SAME_GARMENTS * same[g] * alike[g] + lean * alike[g] / (alike[g] @ counts).clamp_min(1)
+        share = SAME_GARMENTS * same[g] * alike[g] + shrinkage * alike[g] / (alike[g] @ counts).clamp_min(1)
         share[g] += 1 - SAME_GARMENTS
         covariances.append(colour + torch.einsum("h,hij->ij", share / (share @ counts).clamp_min(1e-6), scatter))
     return covariances

@@ -21,7 +21,7 @@ WORDS = AttributeVocabulary(
     },
     {"height": (1.7, 0.1)},
 )
-CONFIG = PriorConfig(lean=0.4, axes=4, shared=1)
+CONFIG = PriorConfig(shrinkage=0.4, axes=4, shared=1)
 ONE_EACH = PersonComponents(torch.zeros(1, 1, 7), torch.ones(1, 7, 1), torch.arange(7), torch.ones(7))
 """A component for each of seven cells."""
 DRESS = {"sex": "female", "outfit": "dress"}
@@ -148,7 +148,7 @@ def test_the_other_sex_in_the_same_garments_counts_by_half():
     women, men = [PEOPLE[400]] * 10, [PEOPLE[-1]] * 40
     c = 0.01 * torch.randn(50, CLOTHES + 2, generator=torch.Generator().manual_seed(0))
     c[10:, 3] *= 200
-    mixture = fitted(women + men, c, PriorConfig(lean=0.0, axes=4, shared=1))
+    mixture = fitted(women + men, c, PriorConfig(shrinkage=0.0, axes=4, shared=1))
     women_s, men_s = (variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[3].item() for g in range(2))
     assert women_s == pytest.approx(4 * 20 / (10 + 20), rel=0.3)
     assert men_s == pytest.approx(4 * 40 / (40 + 5), rel=0.3)
@@ -161,7 +161,7 @@ def test_few_patterned_people_do_not_lend_their_prints_to_many_plain_ones():
     c[:, 0] += torch.randn(80, generator=torch.Generator().manual_seed(1))
     c[60:, 1] += 3 * torch.randn(20, generator=torch.Generator().manual_seed(2))
     condition = torch.stack([words.encode(person) for person in people])
-    config = PriorConfig(lean=1.0, axes=4, shared=1)
+    config = PriorConfig(shrinkage=1.0, axes=4, shared=1)
     mixture = SimpleNamespace(**fit_mixture(c, CLOTHES, condition, words, config, ONE_EACH))
     plain, patterned = (
         variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[:2]
@@ -179,7 +179,7 @@ def test_details_of_others_are_lent_but_not_their_colours():
     c[:200, :4] *= 300
     c[:200, 4] *= 50
     c[200:, :2] += 2 * torch.randn(12, 1, generator=torch.Generator().manual_seed(1))
-    dress = fitted(women + men, c, PriorConfig(groups=("outfit", "sex"), lean=10.0, axes=4, shared=1))
+    dress = fitted(women + men, c, PriorConfig(groups=("outfit", "sex"), shrinkage=10.0, axes=4, shared=1))
     g = part(dress, **DRESS, hair="bob", shoes="boots")[0]
     own = dress.axes[g].T @ torch.diag(dress.variance[g] - dress.left[g]) @ dress.axes[g]
     seam = torch.tensor([1.0, -1.0, 0.0, 0.0, 0.0])
