@@ -15,7 +15,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.capture.dataset import stack
-from primdiffusion.capture.people_files import LARGEST_BETA
+from primdiffusion.capture.people_files import LARGEST_CAPTURED_BETA
 from primdiffusion.capture.reader import (
     CAMERAS_FILE,
     Captures,
@@ -200,10 +200,10 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
     )
     if body is not default_body():
         name, remedy = "encoder's body", "use captures that are fitted to the SMPL file that the encoder refers to"
-    if len(betas) > components or not (betas.abs() <= LARGEST_BETA).all():
+    if len(betas) > components or not (betas.abs() <= LARGEST_CAPTURED_BETA).all():
         raise ValueError(
             f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "
-            f"{components} of the {name}, within {LARGEST_BETA:g}: {remedy}"
+            f"{components} of the {name}, within {LARGEST_CAPTURED_BETA:g}: {remedy}"
         )
     distance = float(np.linalg.norm(joints_from_body(subject, body), axis=-1).max())
     if not distance <= SAME_BODY_M:

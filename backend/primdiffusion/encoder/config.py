@@ -19,8 +19,8 @@ class EncoderConfig(Checked):
     """Architecture of the encoder (paper sec. 3.2; SPEC 2)."""
 
     appearance: Literal["voxels", "texels", "texture"] = "voxels"
-    """Place where images are sampled: on the body surface at each texel (paper), at each voxel of the boxes, or as a texture
-    of 512 x 512 texels, resized to 256 x 256 (SPEC 2)."""
+    """Place where images are sampled: on the body surface at each texel (paper), at each voxel of the boxes, or as a
+    texture of 512 x 512 texels, resized to 256 x 256 (SPEC 2)."""
     masks: Literal["whole", "eroded"] = "whole"
     """eroded: images and masks lose the pixels within one of the mask's outline, as in the released code's training."""
     unseen: Literal["filled", "black"] = "filled"

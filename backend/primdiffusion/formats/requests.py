@@ -90,8 +90,8 @@ class Conditioning:
     """Attributes, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7. `info` lists the names and values that a
     checkpoint knows."""
     guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 2.0
-    """Classifier-free guidance scale of the attributes, in a new human also of those that the seed chooses: 1 follows the
-    training data; more exaggerates and costs variety."""
+    """Strength of attributes (classifier-free guidance), also of those that the seed chooses: 1 follows the training
+    data; more exaggerates and costs variety."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
