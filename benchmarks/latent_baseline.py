@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.human import Human, decode_humans
 from primdiffusion.training.config import NetworkTraining
@@ -69,7 +69,7 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
     prior, chain = denoiser.prior, model.chain(schedule.length, steps)
     starts = []
     for seed in seeds:
-        generator = seeded(seed)
+        generator = seeded_generator(seed)
         clean, _ = prior.split(prior.sample(1, generator))
         noise = torch.randn(clean.shape, generator=generator)
         starts.append(schedule.signal(chain[0]) * clean + schedule.noise(chain[0]) * noise)
@@ -78,6 +78,6 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
         return denoiser.coefficients(y, torch.full((len(y),), t))
 
     with torch.inference_mode():
-        *_, last = SAMPLERS["ddim"](denoise, schedule, torch.cat(starts), chain, seeded(0))
+        *_, last = SAMPLERS["ddim"](denoise, schedule, torch.cat(starts), chain, seeded_generator(0))
         x0 = prior.join(last.x0, prior.rest_variance.sqrt() * decoded_rest(denoiser, last.x0)).clone()
         return [human.validate() for human in decode_humans(model, x0, seeds)]

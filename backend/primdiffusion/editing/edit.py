@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep
 from primdiffusion.diffusion.schedule import early_steps
 from primdiffusion.human import Human
@@ -63,8 +63,8 @@ def encoded(model: DiffusionModel, human: Human) -> Float[Tensor, "1 c h w"]:
 
 def edit_generator(seed: int) -> torch.Generator:
     """Return the noise generator of an edit. Raises ValueError for a seed outside 0 ... 2^63-1."""
-    seeded(seed)
-    return seeded(seed ^ EDIT_SEED_MASK)
+    seeded_generator(seed)
+    return seeded_generator(seed ^ EDIT_SEED_MASK)
 
 
 def kept_attributes(

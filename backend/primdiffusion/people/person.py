@@ -147,8 +147,8 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
     textures: dict[str, UInt8[np.ndarray, "H W 4"]] = {
         "body": skin_picture,
         "eyes": appearance.eye_texture(assets, iris),
-        "eyebrows": appearance.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
-        "eyelashes": appearance.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
+        "eyebrows": appearance.tint_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
+        "eyelashes": appearance.tint_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
         "outfit": garments.coloured(garments.cloth(assets, base, choice.outfit), outfit),
         "shoes": garments.coloured(garments.cloth(assets, base, choice.shoes), shoes),
     }

@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 from diffusion_people import small_model
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.schedule import early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
 from primdiffusion.editing.inpaint import harmonise, inpaint
@@ -80,7 +80,7 @@ def test_the_seed_that_made_a_person_does_not_lead_an_edit_back_to_them():
     person = generate(model, 5, steps=4)
     moved = [distance(vary(model, person, 1.0, seed, steps=4), person) for seed in (5, 6, 7)]
     assert moved[0] > 0.3 * max(moved)
-    noises = [torch.randn(4, generator=make(5)) for make in (seeded, edit_generator)]
+    noises = [torch.randn(4, generator=make(5)) for make in (seeded_generator, edit_generator)]
     assert not torch.isclose(*noises).any()
 
 
