@@ -14,6 +14,7 @@ from PIL import Image
 from scipy import ndimage, sparse, spatial
 from torch import Tensor
 
+from primdiffusion.export.simplify import simplify_and_unwrap
 from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.formats.joints import JOINT_NAMES
