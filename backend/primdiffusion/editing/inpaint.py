@@ -21,10 +21,10 @@ from primdiffusion.editing.edit import (
     OnStep,
     combined,
     conditional_denoiser,
-    decoded,
+    decode_latents,
     edit_generator,
     edit_timesteps,
-    encoded,
+    encode_human,
     kept_attributes,
     match_density,
     run_sampler,
@@ -150,13 +150,13 @@ def inpaint(
     chain = model.chain(model.schedule.length, steps)
     model = match_density(model, human)
     denoise = conditional_denoiser(model, attributes, guidance)
-    known, inside = encoded(model, human), model.cell_mask(region)
+    known, inside = encode_human(model, human), model.cell_mask(region)
     start = start_like(model, known, inside, chain[0], model.condition(attributes), generator)
     sampler = MASKED_SAMPLERS[masking](denoise, model.schedule, start, known, inside, chain, generator)
     x0 = run_sampler(sampler, on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
     edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **model_provenance(model)}
-    return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
+    return with_edit(human, edit, combined(region, decode_latents(model, x0), human.payload))
 
 
 def start_like(
@@ -201,11 +201,11 @@ def harmonise(
     chain = edit_timesteps(model, amount, steps)
     payload = human.payload
     if chain:
-        known, inside = encoded(model, human), model.cell_mask(region)
+        known, inside = encode_human(model, human), model.cell_mask(region)
         start = add_noise(model.schedule, known, chain[0], generator)
         denoise = conditional_denoiser(model, kept_attributes(model, human, known, {}), guidance=1.0)
         x0 = run_sampler(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
-        payload = combined(region, decoded(model, x0), human.payload)
+        payload = combined(region, decode_latents(model, x0), human.payload)
     edit = {
         "edit": "harmonise",
         "region": name_region(region, human.body_setup),

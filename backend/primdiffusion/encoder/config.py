@@ -83,7 +83,7 @@ class EncoderConfig(Checked):
     colour_gain: float = 0.06
     """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not compensate for wrong densities."""
     density_gain: float = 0.25
-    """As `colour_gain`, for relative densities."""
+    """Same as `colour_gain`, for relative densities."""
     full_density: float = 100.0
     """1/m: the density that corresponds to a relative density of 1."""
 

@@ -179,12 +179,12 @@ class NormalisedConvolution(nn.Module):
         return functional.relu(self.bn(self.conv(x)))
 
 
-def average_pooled(x: Tensor) -> Tensor:
+def average_pool(x: Tensor) -> Tensor:
     """3 x 3 average pooling without the padding."""
     return functional.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
 
 
-def max_pooled(x: Tensor) -> Tensor:
+def max_pool(x: Tensor) -> Tensor:
     """3 x 3 max pooling, for the last block."""
     return functional.max_pool2d(x, 3, 1, 1)
 
@@ -197,7 +197,7 @@ class InceptionBlock(nn.Module):
         channels: int,
         branches: Mapping[str, Sequence[Layer]],
         pooled: int | None,
-        pooling: Callable[[Tensor], Tensor] = average_pooled,
+        pooling: Callable[[Tensor], Tensor] = average_pool,
     ) -> None:
         """Build it; `pooled` are the channels of the pooling branch, None in blocks that halve width and height."""
         super().__init__()
@@ -265,7 +265,7 @@ class Inception(nn.Module):
             "branch3x3": [(384, 1), (384, (1, 3), (3, 1))],
             "branch3x3dbl": [(448, 1), (384, 3), (384, (1, 3), (3, 1))],
         }
-        self.Mixed_7b, self.Mixed_7c = InceptionBlock(1280, wide, 192), InceptionBlock(2048, wide, 192, max_pooled)
+        self.Mixed_7b, self.Mixed_7c = InceptionBlock(1280, wide, 192), InceptionBlock(2048, wide, 192, max_pool)
         self.requires_grad_(False).eval()
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 2048"]:

@@ -1,4 +1,4 @@
-"""What the child sends: answers to the requests of `requests`, errors, and notifications. Each is declared here, once.
+"""Messages of the child: answers to the requests of `requests`, errors, and notifications. Each is declared here, once.
 
 Fields without a default are those that the extension needs; it reads the answers of other versions too.
 """
@@ -228,7 +228,7 @@ class ErrorData(Open):
 
     kind: str = ""
     remedy: str = ""
-    """What to do next; empty where the message says it."""
+    """Next step; empty where the message says it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

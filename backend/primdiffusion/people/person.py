@@ -18,7 +18,7 @@ from primdiffusion.people.fitting import (
     cover,
     fit_item,
     item_skinning,
-    lengthened,
+    lengthen,
     shown_faces,
     sink_below_cloth,
     skin_under_hem,
@@ -105,7 +105,7 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
     fitted = {name: fit_item(assets, base, path, vertices) for name, path in worn.items()}
     skirt = skirt_faces(choice.outfit, pairs["outfit"][1])
     if choice.outfit.lengthened != 1:
-        fitted["outfit"] = lengthened(fitted["outfit"], pairs["outfit"][1].faces[skirt], choice.outfit.lengthened)
+        fitted["outfit"] = lengthen(fitted["outfit"], pairs["outfit"][1].faces[skirt], choice.outfit.lengthened)
     shoes = pairs["shoes"][1].faces
     sock_pieces = [number for number, piece in enumerate(choice.shoes.pieces) if piece.kind == "sock"]
     sock = np.isin(connected_faces(shoes, len(pairs["shoes"][1].vertices)), sock_pieces)

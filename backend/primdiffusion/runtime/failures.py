@@ -22,7 +22,7 @@ class ErrorDescription:
     kind: str
     sentence: str
     remedy: str
-    """What to do next; empty if the sentence says so already."""
+    """Next step; empty if the sentence says so already."""
 
     def __str__(self) -> str:
         return f"{self.sentence}: {self.remedy}" if self.remedy else self.sentence

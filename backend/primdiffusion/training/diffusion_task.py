@@ -1,4 +1,4 @@
-"""What training of either preset of the diffusion model has in common: optimiser, held-out errors, pictures; and
+"""The part of training that both presets of the diffusion model share: optimiser, held-out errors, pictures; and
 the preset `paper`: the paper's U-Net on whole slabs (paper sec. 3.3, SPEC 3).
 """
 

@@ -105,7 +105,7 @@ def _keys(condition: Float[Tensor, "n x"], vocabulary: AttributeVocabulary, conf
 def _effects(
     c: Float[Tensor, "n r"], clothes: int, keys: Sequence[Key]
 ) -> tuple[list[Float[Tensor, "v r"]], Float[Tensor, "n r"]]:
-    """What every choice of every key adds to the mean, and what they leave, by backfitting.
+    """Effects of every choice of every key on the mean, and the remainder, by backfitting.
 
     Groups say what clothes are like, and heads what hands and head are like. The other keys add what they show to:
     long hair hangs over a collar, but the shirts of the few people who have it do not colour everybody's.
@@ -129,7 +129,7 @@ def _ridge(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"]) -> Float[Tenso
 
 
 def _shown(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"], freedoms: int) -> Float[Tensor, "v r"]:
-    """As `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
+    """Same as `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
 
     F compares what the design's degrees of freedom explain with what they would explain by chance.
     """

@@ -11,7 +11,7 @@ from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.schedule import early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
 from primdiffusion.editing.inpaint import harmonise, inpaint
-from primdiffusion.editing.interpolate import interpolate, inversion_steps, inverted, slerp
+from primdiffusion.editing.interpolate import interpolate, inversion_steps, invert, slerp
 from primdiffusion.editing.regions import region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
@@ -289,7 +289,7 @@ def test_ddim_backwards_and_forwards_returns_the_nearer_the_more_steps():
 
     def loss(steps):
         chain = inversion_steps(model.schedule, steps)
-        *_, up = inverted(model.denoise, model.schedule, x0, chain)
+        *_, up = invert(model.denoise, model.schedule, x0, chain)
         *_, down = ddim(model.denoise, model.schedule, up.x, chain, [])
         return float((down.x0 - x0).norm() / x0.norm())
 

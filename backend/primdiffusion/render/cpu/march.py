@@ -44,7 +44,7 @@ def march_cpu(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     span: Span | None = None,
 ) -> Rendering:
-    """As `march_reference`, in float32 on the CPU on all processors.
+    """Same as `march_reference`, in float32 on the CPU on all processors.
 
     Differentiable, once, in every tensor of `primitives` and `camera`, from rgb, alpha and depth. The first call on a
     machine compiles (some 10 s, the first backward pass as much again); the result is cached on disk. Memory beyond the
