@@ -22,7 +22,7 @@ from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.human import Human, decode_humans
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
-from primdiffusion.training.losses import blends, mixed, weighted_error
+from primdiffusion.training.losses import blends, mix, weighted_error
 from torch import Tensor
 
 STEPS = 30
@@ -52,7 +52,7 @@ class DecoderObjective:
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted error of a random batch."""
         weights, indices = blends(self.people, self.config.batch, self.config.blend, generator)
-        z = mixed(self.people.latents, weights, indices)
+        z = mix(self.people.latents, weights, indices)
         flip = torch.rand(len(z), generator=generator) < 0.5
         z[flip] = self.codec.mirror(z[flip])
         coefficients, rest = self.denoiser.prior.split(z)

@@ -132,7 +132,7 @@ def with_edit(human: Human, edit: Mapping[str, Any], payload: Payload, betas: Te
     ).validate()
 
 
-def combined(region: Tensor, inside: Payload, outside: Payload) -> Payload:
+def combine(region: Tensor, inside: Payload, outside: Payload) -> Payload:
     """Combine two payloads: `inside` in the region [K], `outside`, bit for bit, elsewhere; on the CPU."""
 
     def chosen(name: str) -> Tensor:

@@ -19,7 +19,7 @@ from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, ga
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
 from primdiffusion.editing.edit import (
     OnStep,
-    combined,
+    combine,
     conditional_denoiser,
     decode_latents,
     edit_generator,
@@ -156,7 +156,7 @@ def inpaint(
     x0 = run_sampler(sampler, on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
     edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **model_provenance(model)}
-    return with_edit(human, edit, combined(region, decode_latents(model, x0), human.payload))
+    return with_edit(human, edit, combine(region, decode_latents(model, x0), human.payload))
 
 
 def start_like(
@@ -205,7 +205,7 @@ def harmonise(
         start = add_noise(model.schedule, known, chain[0], generator)
         denoise = conditional_denoiser(model, kept_attributes(model, human, known, {}), guidance=1.0)
         x0 = run_sampler(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
-        payload = combined(region, decode_latents(model, x0), human.payload)
+        payload = combine(region, decode_latents(model, x0), human.payload)
     edit = {
         "edit": "harmonise",
         "region": name_region(region, human.body_setup),

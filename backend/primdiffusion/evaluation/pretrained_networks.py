@@ -149,7 +149,7 @@ def load_matching(network: nn.Module, weights: Mapping[str, Tensor], what: str, 
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
 
 
-def resized(pictures: Float[Tensor, "n h w 3"], side: int) -> Float[Tensor, "n 3 side side"]:
+def resize(pictures: Float[Tensor, "n h w 3"], side: int) -> Float[Tensor, "n 3 side side"]:
     """Pictures of side x side pixels, bilinear between the two nearest pixels from the corner of each, as TensorFlow 1
     and torch-fidelity resize them."""
     x = pictures.movedim(-1, 1)
@@ -270,7 +270,7 @@ class Inception(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 2048"]:
         """Features of sRGB-encoded pictures in [0, 1]."""
-        x = (255 * resized(pictures, self.SIDE) - 128) / 128  # of bytes, as in the TensorFlow graph
+        x = (255 * resize(pictures, self.SIDE) - 128) / 128  # of bytes, as in the TensorFlow graph
         x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
         x = self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(functional.max_pool2d(x, 3, 2)))
         x = functional.max_pool2d(x, 3, 2)
@@ -318,7 +318,7 @@ class ClipVision(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 512"]:
         """Features of sRGB-encoded square pictures in [0, 1]."""
-        x = resized(pictures, self.SIDE)
+        x = resize(pictures, self.SIDE)
         mean, std = (x.new_tensor(values)[:, None, None] for values in (self.MEAN, self.STD))
         patches = self.conv1((x - mean) / std).flatten(2).mT
         first = self.class_embedding.expand(len(x), 1, -1)

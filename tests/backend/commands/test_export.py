@@ -15,7 +15,7 @@ from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.commands.export import gaussians, merge, proxy
 from primdiffusion.commands.session import Session
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.requests import GaussiansRequest, MergeRequest, PosedPerson, ProxyRequest
 from primdiffusion.human import generate, place, pose_body
@@ -163,7 +163,7 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, pos
         got = grid["density"].sum(dtype=np.float64)
     grown, ungrown = (
         upright_grid(place(one, pose(2)), VOXEL).density.sum(dtype=np.float64)
-        for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
+        for one in (reshape_human(human, betas), dataclasses.replace(human, betas=betas))
     )
     assert abs(grown / ungrown - 1) > 0.02
     assert got == pytest.approx(grown, rel=1e-3)
