@@ -59,17 +59,17 @@ def test_a_posed_person_becomes_gaussians(saved):
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--out", "anna.stl"], "^out is 'anna.stl': give"),
-        (["--out", "anna.glb", "--pose", "pose.json"], "^pose cannot be stored"),
-        (["--out", "anna.ply", "--frame", "2"], "^frame is 2"),
+        (["--out", "anna.stl"], "out is 'anna.stl': give"),
+        (["--out", "anna.glb", "--pose", "pose.json"], "pose cannot be stored"),
+        (["--out", "anna.ply", "--frame", "2"], "frame is 2"),
         (["--out", "nowhere/anna.glb"], "there is no folder"),
-        (["--out", "anna.npz", "--voxel", "0"], "^voxel is 0"),
-        (["--out", "anna.npz", "--voxel", "0.0001"], "choose .* mm or more"),
+        (["--out", "anna.npz", "--voxel", "0"], "voxel is 0"),
+        (["--out", "anna.npz", "--voxel", "0.0001"], "mm or more"),
     ],
 )
 def test_what_cannot_be_exported_is_rejected_before_any_work(saved, monkeypatch, more, sentence):
     monkeypatch.chdir(saved.parent)
-    with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+    with refused((ValueError, FileNotFoundError), sentence):
         cli.run(["export", str(saved), *more])
     assert list(saved.parent.iterdir()) == [saved]
 

@@ -12,6 +12,7 @@ from human_files import folder_of, person_file
 from oracle import TOLERANCE_M, blended_vertices, evaluated_matrices, raised, surface_frames, world_from_model
 from scene_stage import replace
 from support import tensor_files
+from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
@@ -226,10 +227,10 @@ def with_renamed_bone(_context, anna):
 
 
 REFUSED = {
-    r"'Human' is in Edit Mode: leave it": (in_edit_mode, SHAPE),
-    r"no bone 'left_knee'.*name again": (with_renamed_bone, SHAPE),
-    r"a shape is 10 numbers from -5 to 5, not": (lambda *_: None, SHAPE * 4),
-    r"a shape is 10 numbers .*, not \[1.0\]": (lambda *_: None, [1.0]),
+    "'Human' is in Edit Mode: leave it": (in_edit_mode, SHAPE),
+    "no bone 'left_knee'": (with_renamed_bone, SHAPE),
+    "a shape is 10 numbers from -5 to 5, not": (lambda *_: None, SHAPE * 4),
+    ", not [1.0]": (lambda *_: None, [1.0]),
 }
 
 
@@ -239,7 +240,7 @@ def test_what_cannot_be_reshaped_is_rejected_untouched(anna, saved_scene, senten
     change, betas = REFUSED[sentence]
     change(saved_scene, anna)
     before = list(anna[BETAS])
-    with pytest.raises(ValueError, match=sentence):
+    with refused(ValueError, sentence):
         reshape(anna, betas)
     assert list(anna[BETAS]) == before
     if anna.mode == "EDIT":
