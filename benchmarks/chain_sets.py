@@ -14,7 +14,7 @@ from primdiffusion.body.model import BodyPose, ShapedBody, default_body
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.diffusion.codec import CellCodec, cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.model import DiffusionModel, sample, seeded
+from primdiffusion.diffusion.model import DiffusionModel, sample, seeded_generator
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.motion import built_in_vectors
 from primdiffusion.geometry.camera import Camera
@@ -169,7 +169,7 @@ def latents_of(model: DiffusionModel, person: PersonVariants) -> Tensor:
 
 def denoised_once(model: DiffusionModel, x0: Tensor, seed: int) -> Iterator[tuple[int, Tensor]]:
     """One denoising step from each of NOISE_STEPS, all with the same noise."""
-    noise = torch.randn(x0.shape, generator=seeded(seed))
+    noise = torch.randn(x0.shape, generator=seeded_generator(seed))
     for t in NOISE_STEPS:
         yield t, model.denoise(model.schedule.q_sample(x0, torch.tensor([t]), noise), t)
 

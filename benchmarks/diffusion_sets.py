@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.formats import requests
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
@@ -46,7 +46,7 @@ def gaussian(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
         raise TypeError("only the default architecture holds a Gaussian of its training people")
     prior = model.denoiser.prior.gaussian()
     for seed in seeds:
-        x0 = prior.sample(1, seeded(seed))
+        x0 = prior.sample(1, seeded_generator(seed))
         yield Human(model.decode(x0[0]), model.betas(x0, [seed])[0], {"seed": seed}).to("cpu")
 
 

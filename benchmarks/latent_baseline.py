@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.human import Human, decode_humans
 from primdiffusion.training.config import NetworkTraining
 from primdiffusion.training.latents import LatentSet
-from primdiffusion.training.losses import blends, mixed, weighted_error
+from primdiffusion.training.losses import blends, mix, weighted_error
 from torch import Tensor
 
 STEPS = 30
@@ -52,7 +52,7 @@ class DecoderObjective:
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted error of a random batch."""
         weights, indices = blends(self.people, self.config.batch, self.config.blend, generator)
-        z = mixed(self.people.latents, weights, indices)
+        z = mix(self.people.latents, weights, indices)
         flip = torch.rand(len(z), generator=generator) < 0.5
         z[flip] = self.codec.mirror(z[flip])
         coefficients, rest = self.denoiser.prior.split(z)
@@ -69,7 +69,7 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
     prior, chain = denoiser.prior, model.chain(schedule.length, steps)
     starts = []
     for seed in seeds:
-        generator = seeded(seed)
+        generator = seeded_generator(seed)
         clean, _ = prior.split(prior.sample(1, generator))
         noise = torch.randn(clean.shape, generator=generator)
         starts.append(schedule.signal(chain[0]) * clean + schedule.noise(chain[0]) * noise)
@@ -78,6 +78,6 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
         return denoiser.coefficients(y, torch.full((len(y),), t))
 
     with torch.inference_mode():
-        *_, last = SAMPLERS["ddim"](denoise, schedule, torch.cat(starts), chain, seeded(0))
+        *_, last = SAMPLERS["ddim"](denoise, schedule, torch.cat(starts), chain, seeded_generator(0))
         x0 = prior.join(last.x0, prior.rest_variance.sqrt() * decoded_rest(denoiser, last.x0)).clone()
         return [human.validate() for human in decode_humans(model, x0, seeds)]

@@ -123,7 +123,7 @@ def grown(human: Human, betas: torch.Tensor, share: float) -> Human:
     """The person reshaped with another share."""
     usual, reshaping.SHARE = reshaping.SHARE, share
     try:
-        return reshaping.reshaped(human, betas)
+        return reshaping.reshape_human(human, betas)
     finally:
         reshaping.SHARE = usual
 

@@ -107,6 +107,8 @@ class Layout:
         self.items.append(ROW)
 
     def prop(self, owner: Any, name: str, text: str | None = None, expand: bool = False, **_: Any) -> None:
+        if owner is None:  # the view, without a window
+            return self.items.append(ROW)
         found = owner.bl_rna.properties[name]
         self.texts.append(found.name if text is None else text)
         listed = found.type == "ENUM" and (found.is_enum_flag or expand) and not self.across

@@ -62,7 +62,7 @@ TRIED = 7
 """Steps that are timed to plan the others; the first two are warm-up."""
 CHANNELS = 64
 """Numbers of a cell, as many as a primitive has in our codec."""
-LOCAL = NetworkTraining(steps=1, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True)
+LOCAL = NetworkTraining(steps=1, batch=16, blend_fraction=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True)
 """Training of the default model; steps follow from the time."""
 
 

@@ -26,7 +26,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import SCHEDULES
-from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
+from primdiffusion.diffusion.unet import TimeEmbedding, zero_weights
 from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.geometry.image import decode_srgb, encode_srgb
 from primdiffusion.geometry.records import TensorRecord
@@ -307,7 +307,7 @@ class VoxelUNet(nn.Module):
         self.up = nn.ModuleList(VoxelBlock(2 * width, width, condition_width) for width in widths)
         self.shrink = nn.ModuleList(nn.Conv3d(width, wider, 2, stride=2) for width, wider in pairs)
         self.grow = nn.ModuleList(nn.Conv3d(wider, width, 1) for width, wider in pairs)
-        self.norm, self.outer = nn.LayerNorm(widths[0]), zeroed(nn.Linear(widths[0], channels))
+        self.norm, self.outer = nn.LayerNorm(widths[0]), zero_weights(nn.Linear(widths[0], channels))
 
     def forward(
         self,

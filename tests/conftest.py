@@ -20,10 +20,8 @@ CHECKED = [
         "geometry.camera",
         "geometry.surface",
         "body.model",
-        "body.skinning",
         "primitives.primitives",
         "primitives.anchors",
-        "primitives.slab",
         "render.reference",
     )
 ]

@@ -47,7 +47,7 @@ class Backdrop:
     """The rasterised solids of an image."""
 
     solids: Image
-    """At FINER times the image resolution."""
+    """Image of the solids, at FINER times the resolution."""
     hole: Bool[ndarray, "fh fw"]
     """Samples that hit a holdout, at the same resolution."""
     end: Float32[ndarray, "h w"]
@@ -342,7 +342,7 @@ class DrawProgress:
 def draw_in_bands(
     picture: Image, scene: Scene, camera: Camera, look: ViewSettings, pixels_a_second: float | None = None
 ) -> Iterator[DrawProgress]:
-    """As `draw`, but fill `picture` in bands from the top; `pixels_a_second` is the measured speed, if known."""
+    """Same as `draw`, but fills `picture` in bands from the top; `pixels_a_second` is the measured speed, if known."""
     top, rows, seconds = 0, camera.height, 0.0
     speeds: list[float] = []
     while top < camera.height:

@@ -30,7 +30,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import polar
-from primdiffusion.primitives.anchors import Anchors, attach, default_anchors, stretched
+from primdiffusion.primitives.anchors import Anchors, attach, default_anchors, stretch
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.runtime.device import on_fixed_threads
@@ -58,7 +58,7 @@ class Human(TensorRecord):
     betas: Float[Tensor, "n"]
     """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
-    """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
+    """Origin of the human; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
     sample, attributes and guidance if requested, `unfollowed` (the values that it shows instead of requested ones,
     `diffusion.model`), checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
@@ -131,7 +131,7 @@ def generate_batch(
     if model.vocabulary.width:
         conditioning["guidance"] = guidance
     ending = {} if end == CLEAN else {"end": end}
-    shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
+    shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **model_provenance(model)}
     people = decode_humans(model, final, seeds, attributes)
     missed = ({"unfollowed": names} if names else {} for names in unfollowed(model, final, attributes))
     return [
@@ -158,7 +158,7 @@ def decode_humans(
     return people
 
 
-def made_by(model: DiffusionModel) -> dict[str, Any]:
+def model_provenance(model: DiffusionModel) -> dict[str, Any]:
     """The provenance entries that describe the model and the program version."""
     of_file = {"checkpoint_sha256": model.card["sha256"]} if "sha256" in model.card else {}
     return {
@@ -203,7 +203,7 @@ def sole_height(human: Human) -> float:
 
 
 def place_on_floor(human: Human, pose: BodyPose | None = None) -> Primitives:
-    """As `place`, in a world whose y is 0 at `sole_height`."""
+    """Same as `place`, in a world whose y is 0 at `sole_height`."""
     placed = place(human, pose)
     return dataclasses.replace(placed, position=placed.position - torch.tensor([0.0, sole_height(human), 0.0]))
 
@@ -211,16 +211,16 @@ def place_on_floor(human: Human, pose: BodyPose | None = None) -> Primitives:
 def frames_of(
     human: Human, pose: BodyPose | None = None, body: BodyModel | None = None, anchors: Anchors | None = None
 ) -> Frames:
-    """Where `place` puts the human's primitives, and how large they are before their delta scales."""
+    """Frames where `place` puts the human's primitives, with their extents before the delta scales."""
     body, anchors = body_of(human, body, anchors)
     return _frames(human, pose_body(human.betas, pose, body).vertices, body, anchors)
 
 
 def default_frames(betas: Float[Tensor, "n"], pose: BodyPose) -> Frames:
-    """As `frames_of` for a human of this shape on the default body; differentiable in both."""
+    """Same as `frames_of`, for a human of this shape on the default body; differentiable in both."""
     body, anchors = default_body(), default_anchors()
     vertices = pose_body(betas, pose).vertices
-    return stretched(attach(anchors, vertices, body.faces), anchors, vertices, body.shape(betas).vertices)
+    return stretch(attach(anchors, vertices, body.faces), anchors, vertices, body.shape(betas).vertices)
 
 
 def place_skinned(
@@ -271,7 +271,7 @@ def _frames(human: Human, vertices: Float[Tensor, "v 3"], body: BodyModel, ancho
     frames = attach(anchors, vertices, body.faces)
     if human.body_setup is not None:
         return frames
-    return stretched(frames, anchors, vertices, body.shape(human.betas).vertices)
+    return stretch(frames, anchors, vertices, body.shape(human.betas).vertices)
 
 
 def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None = None) -> tuple[BodyModel, Anchors]:

@@ -31,7 +31,7 @@ from primdiffusion.files.regular_files import printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import FieldError, read, written
-from primdiffusion.runtime.failures import shortened, to_user_error, traceback_of
+from primdiffusion.runtime.failures import shorten, to_user_error, traceback_of
 from primdiffusion.runtime.machine import memory, share_processors
 from primdiffusion.version import __version__
 
@@ -311,7 +311,7 @@ def _parameters(message: RpcRequest) -> Any:
     try:
         return read(REQUESTS[message.method], message.params, message.method)
     except FieldError as e:
-        raise RpcError(INVALID_PARAMS, printable(shortened(str(e)))) from e
+        raise RpcError(INVALID_PARAMS, printable(shorten(str(e)))) from e
 
 
 def _as_rpc_error(error: Exception) -> RpcError:

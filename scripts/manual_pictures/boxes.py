@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import betas_of_measures, default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.image import encode_srgb
 from primdiffusion.human import Human, generate, place
@@ -30,7 +30,7 @@ def boxes(out: Path) -> None:
     human = generate(load_checkpoint(), SEED)
     betas = betas_of_measures(human.betas, torch.eye(10), default_body(), HEIGHT_M, WEIGHT_KG).float()
     of_the_paper = dataclasses.replace(human, betas=betas)
-    pictures = [_torso(person) for person in (of_the_paper, reshaped(human, betas))]
+    pictures = [_torso(person) for person in (of_the_paper, reshape_human(human, betas))]
     save_jpeg(Image.fromarray(np.concatenate(pictures, 1)), out)
 
 

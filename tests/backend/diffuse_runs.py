@@ -25,7 +25,8 @@ def make_small(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(diffusion_task, "HEIGHT", 40)
     patch.setattr(diffusion_task, "STEP", 0.03)
     patch.setattr(diffusion_task, "x0_errors", functools.partial(losses.x0_errors, levels=(500,)))
-    patch.setattr(diffusion_task, "write_samples", functools.partial(diffusion_task.write_samples, seeds=(0,), steps=1))
+    patch.setattr(diffusion_task, "SEEDS", (0,))
+    patch.setattr(diffusion_task, "generate_batch", functools.partial(diffusion_task.generate_batch, steps=1))
     AcceleratorState._reset_state(reset_partial_state=True)
 
 

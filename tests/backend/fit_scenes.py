@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import itertools
 from pathlib import Path
 from unittest import mock
@@ -33,8 +32,7 @@ def make_small(patch: pytest.MonkeyPatch) -> None:
     """The default encoder becomes a tiny one, and what is measured small."""
     patch.setitem(PRESETS, "default", dataclasses.replace(TINY, appearance="texels"))
     patch.setattr(fit_module, "SIZE", 24)
-    patch.setattr(fit_module, "measure", functools.partial(fit_module.measure, people=1))
-    patch.setattr(fit_module, "write_pictures", functools.partial(fit_module.write_pictures, people=2))
+    patch.setattr(fit_module, "PEOPLE", 2)
     forget_processes()
 
 

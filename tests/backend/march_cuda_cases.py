@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from march_scenes import camera_at, one_box, random_boxes
+from march_scenes import camera_at, gradients, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cuda import graph as cuda_graph
@@ -243,26 +243,10 @@ def test_a_batch_draws_each_person_from_each_view(settings, density):
         assert expected.alpha.max() > 0.1
 
 
-def gradients(render, boxes: Primitives, camera: Camera, seed: int = 0) -> dict[str, Tensor]:
-    """Of a random mix of rgb, alpha and finite depths; `render` maps leaves to a picture."""
-    leaves = [record.map(lambda tensor: tensor.detach().clone().requires_grad_()) for record in (boxes, camera)]
-    picture = render(*leaves)
-    generator = torch.Generator().manual_seed(seed)
-
-    def some(value: Tensor) -> Tensor:
-        weight = torch.randn(value.shape, generator=generator, dtype=torch.float64)
-        return (value * weight.to(value)).sum()
-
-    depth = torch.where(torch.isfinite(picture.depth), picture.depth, 0)
-    (some(picture.rgb) + some(picture.alpha) + some(depth)).backward()
-    every = {name: getattr(leaves[0], name).grad for name in FIELDS} | {n: getattr(leaves[1], n).grad for n in VIEW}
-    return {name: grad.cpu().double() for name, grad in every.items()}
-
-
 def assert_same_gradients(got: dict[str, Tensor], expected: dict[str, Tensor], largest: float = 1e-3) -> None:
     """Cosine at least 0.9999, and a relative error that shows the scale to be right, too."""
-    for name, value in expected.items():
-        other = got[name].reshape(value.shape)
+    for name, exact in expected.items():
+        value, other = (gradient.cpu().double().reshape(exact.shape) for gradient in (exact, got[name]))
         norm = value.norm()
         assert norm > 0, name
         assert (value * other).sum() / (norm * other.norm()) >= 0.9999, name

@@ -1,9 +1,12 @@
-"""Scenes for the tests of the marcher and of what goes through it."""
+"""Scenes for the tests of the marcher and of what goes through it, and gradients of pictures of them."""
+
+from collections.abc import Callable
 
 import torch
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.image import Rendering
 from torch import Tensor
 
 
@@ -48,3 +51,33 @@ def camera_at(position: tuple[float, ...], *, fov: float = 0.3, width: int = 24,
     """A camera that looks at the origin."""
     where = torch.tensor(position, dtype=torch.float64)
     return look_at(where, torch.zeros_like(where), vertical_fov=fov, width=width, height=height)
+
+
+def objective(picture: Rendering, seed: int = 5, depth: bool = True) -> Tensor:
+    """Every kind of output, weighted at random, of both signs; depths where they are finite."""
+    generator = torch.Generator().manual_seed(seed)
+    values = [picture.rgb, picture.alpha]
+    if depth:
+        values.append(torch.where(torch.isfinite(picture.depth), picture.depth, 0))
+    return sum(
+        (torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value) * value).sum() for value in values
+    )
+
+
+def gradients(
+    render: Callable[[Primitives, Camera], Rendering],
+    boxes: Primitives,
+    camera: Camera,
+    value: Callable[[Rendering], Tensor] = objective,
+) -> dict[str, Tensor]:
+    """Gradients of a picture's value by the names of the inputs."""
+    boxes, camera = (record.map(lambda tensor: tensor.detach().clone().requires_grad_()) for record in (boxes, camera))
+    leaves = {**vars(boxes), "intrinsics": camera.intrinsics, "world_to_camera": camera.world_to_camera}
+    return dict(zip(leaves, torch.autograd.grad(value(render(boxes, camera)), list(leaves.values())), strict=True))
+
+
+def assert_same_direction_and_length(got: Tensor, expected: Tensor, name: object) -> None:
+    """Direction to a cosine of 0.9999, length to a thousandth."""
+    got, norm = got.double(), expected.norm()
+    assert float((got * expected).sum() / (got.norm() * norm)) >= 0.9999, name
+    assert abs(float(got.norm() / norm) - 1) <= 1e-3, name

@@ -25,6 +25,7 @@ from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from primdiffusion.render.solids import Solids, draw_boxes, shade_solids
+from support.errors import refused
 
 RED = (0.8, 0.1, 0.1)
 BACKGROUND = (0.1, 0.3, 0.6)
@@ -231,5 +232,5 @@ def test_an_empty_scene_is_the_background(camera):
     "wrong", [{"view": "x-ray"}, {"clip": (2.0, 1.0)}, {"clip": (-1.0, 1.0)}, {"clip": (1, math.nan)}]
 )
 def test_unknown_views_and_impossible_planes_are_rejected(wrong):
-    with pytest.raises(ValueError, match=r"x-ray|clip"):
+    with refused(ValueError, wrong.get("view", "clip")):
         ViewSettings(**wrong)

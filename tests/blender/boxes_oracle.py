@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.human import Human, place_skinned, pose_body
 from primdiffusion.human_file import save_body, save_human
 from primdiffusion.primitives.anchors import default_anchors
@@ -43,7 +43,7 @@ def write(folder: Path, count: int, own: bool) -> None:
     for case in range(count):
         betas = human.betas if case % 3 == 0 else 1.5 * torch.randn(10, generator=g)
         pose = BodyPose.from_axis_angle(0.4 * torch.randn(72, generator=g), torch.randn(3, generator=g))
-        person = reshaped(human, betas)
+        person = reshape_human(human, betas)
         joints = pose_body(betas, pose, None if setup is None else setup.body).skinning[:, :3]
         if case % 4 == 3:  # bones that are stretched and sheared
             joints = joints + 0.05 * torch.randn(24, 3, 4, generator=g)

@@ -15,7 +15,7 @@ import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.drawing import Scene, ViewSettings
 from primdiffusion.drawing import draw as compose_scene
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, place
@@ -56,7 +56,7 @@ def placed(
     """A posed person, of other betas if given, then moved, turned and scaled alike in all directions by `world`."""
     human = load_human(Path(folder) / "person.human.safetensors")
     if betas is not None:
-        human = reshaped(human, torch.tensor(betas))
+        human = reshape_human(human, torch.tensor(betas))
     pose = BodyPose(torch.tensor(rotations, dtype=torch.float32), torch.tensor(translation, dtype=torch.float32))
     person, matrix = place(human, pose), torch.tensor(world, dtype=torch.float64)
     scale = float(torch.linalg.det(matrix[:3, :3])) ** (1 / 3)

@@ -13,61 +13,53 @@ from blender_primdiffusion.capture.body import Body, skin, skinning_transforms
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 
-MIXAMO = {
-    "pelvis": "mixamorig:Hips", "spine1": "mixamorig:Spine", "spine2": "mixamorig:Spine1", "spine3": "mixamorig:Spine2",
-    "neck": "mixamorig:Neck", "head": "mixamorig:Head",
-    **{f"{side}_{part}": f"mixamorig:{side.title()}{bone}" for side in ("left", "right") for part, bone in {
-        "hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder", "shoulder": "Arm",
-        "elbow": "ForeArm", "wrist": "Hand", "hand": "HandMiddle1"}.items()},
-}  # fmt: skip
-UNREAL = {
-    "pelvis": "pelvis", "spine1": "spine_01", "spine2": "spine_02", "spine3": "spine_03", "neck": "neck_01",
-    "head": "head",
-    **{f"{side}_{part}": f"{bone}_{side[0]}" for side in ("left", "right") for part, bone in {
-        "hip": "thigh", "knee": "calf", "ankle": "foot", "foot": "ball", "collar": "clavicle", "shoulder": "upperarm",
-        "elbow": "lowerarm", "wrist": "hand", "hand": "middle_01"}.items()},
-}  # fmt: skip
-RENDERPEOPLE = {
-    "pelvis": "hip", "spine1": "spine_01", "spine2": "spine_02", "spine3": "spine_03", "neck": "neck", "head": "head",
-    **{f"{side}_{part}": f"{bone}_{side[0]}" for side in ("left", "right") for part, bone in {
-        "hip": "upperleg", "knee": "lowerleg", "ankle": "foot", "foot": "ball", "collar": "shoulder",
-        "shoulder": "upperarm", "elbow": "lowerarm", "wrist": "hand", "hand": "middle_01"}.items()},
-}  # fmt: skip
-RENDERPEOPLE = {joint: f"rp_anna_rigged_001_{bone}" for joint, bone in RENDERPEOPLE.items()}
-RIGIFY = {
-    "pelvis": "spine", "spine1": "spine.001", "spine2": "spine.002", "spine3": "spine.003", "neck": "spine.004",
-    "head": "spine.006",
-    **{f"{side}_{part}": f"{bone}.{side[0].upper()}" for side in ("left", "right") for part, bone in {
-        "hip": "thigh", "knee": "shin", "ankle": "foot", "foot": "toe", "collar": "shoulder", "shoulder": "upper_arm",
-        "elbow": "forearm", "wrist": "hand", "hand": "f_middle.01"}.items()},
-}  # fmt: skip
-SOMA = {
-    "pelvis": "Hips", "spine1": "Spine1", "spine2": "Spine2", "spine3": "Chest", "neck": "Neck1", "head": "Head",
-    **{f"{side}_{part}": f"{side.title()}{bone}" for side in ("left", "right") for part, bone in {
-        "hip": "Leg", "knee": "Shin", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder", "shoulder": "Arm",
-        "elbow": "ForeArm", "wrist": "Hand", "hand": "HandMiddleEnd"}.items()},
-}  # fmt: skip
-VROID = {
-    "pelvis": "J_Bip_C_Hips", "spine1": "J_Bip_C_Spine", "spine2": "J_Bip_C_Chest", "spine3": "J_Bip_C_UpperChest",
-    "neck": "J_Bip_C_Neck", "head": "J_Bip_C_Head",
-    **{f"{side}_{part}": f"J_Bip_{side[0].upper()}_{bone}" for side in ("left", "right") for part, bone in {
-        "hip": "UpperLeg", "knee": "LowerLeg", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder",
-        "shoulder": "UpperArm", "elbow": "LowerArm", "wrist": "Hand", "hand": "Middle1"}.items()},
-}  # fmt: skip
-MOCAPNET = {
-    "pelvis": "hip", "spine1": "abdomen", "spine2": "waist", "spine3": "chest", "neck": "neck", "head": "head",
-    **{f"{side}_{part}": f"{side[0]}{bone}" for side in ("left", "right") for part, bone in {
-        "hip": "hip", "knee": "knee", "ankle": "foot", "foot": "bigtoe", "collar": "Collar", "shoulder": "shoulder",
-        "elbow": "elbow", "wrist": "hand", "hand": "Mid1"}.items()},
-}  # fmt: skip
-ROKOKO = {
-    "pelvis": "Hips", "spine1": "Spine1", "spine2": "Spine2", "spine3": "Spine4", "neck": "Neck", "head": "Head",
-    **{f"{side}_{part}": f"{side.title()}{bone}" for side in ("left", "right") for part, bone in {
-        "hip": "Thigh", "knee": "Shin", "ankle": "Foot", "foot": "Toe", "collar": "Shoulder", "shoulder": "Arm",
-        "elbow": "ForeArm", "wrist": "Hand", "hand": "Finger3Proximal"}.items()},
-}  # fmt: skip
-RPM = {joint: bone.removeprefix("mixamorig:") for joint, bone in MIXAMO.items()}
+_TRUNK = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
+_LIMBS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
+
+
+def rig(trunk: str, limbs: str, sided: str) -> dict[str, str]:
+    """A rig's bones by SMPL's joints, from the names of its trunk, of its limbs, and how a limb's side is written."""
+    bones = dict(zip(_TRUNK, trunk.split(), strict=True))
+    for side in ("left", "right"):
+        forms = {"side": side.title(), "s": side[0], "S": side[0].upper()}
+        bones |= {
+            f"{side}_{part}": sided.format(bone, **forms) for part, bone in zip(_LIMBS, limbs.split(), strict=True)
+        }
+    return bones
+
+
+RPM = rig(
+    "Hips Spine Spine1 Spine2 Neck Head",
+    "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand HandMiddle1", "{side}{}",
+)  # fmt: skip
 """Ready Player Me."""
+MIXAMO = {joint: f"mixamorig:{bone}" for joint, bone in RPM.items()}
+UNREAL = rig(
+    "pelvis spine_01 spine_02 spine_03 neck_01 head",
+    "thigh calf foot ball clavicle upperarm lowerarm hand middle_01", "{}_{s}",
+)  # fmt: skip
+RENDERPEOPLE = rig(
+    "hip spine_01 spine_02 spine_03 neck head",
+    "upperleg lowerleg foot ball shoulder upperarm lowerarm hand middle_01", "{}_{s}",
+)  # fmt: skip
+RENDERPEOPLE = {joint: f"rp_anna_rigged_001_{bone}" for joint, bone in RENDERPEOPLE.items()}
+RIGIFY = rig(
+    "spine spine.001 spine.002 spine.003 spine.004 spine.006",
+    "thigh shin foot toe shoulder upper_arm forearm hand f_middle.01", "{}.{S}",
+)  # fmt: skip
+SOMA = rig(
+    "Hips Spine1 Spine2 Chest Neck1 Head",
+    "Leg Shin Foot ToeBase Shoulder Arm ForeArm Hand HandMiddleEnd", "{side}{}",
+)  # fmt: skip
+VROID = rig(
+    "J_Bip_C_Hips J_Bip_C_Spine J_Bip_C_Chest J_Bip_C_UpperChest J_Bip_C_Neck J_Bip_C_Head",
+    "UpperLeg LowerLeg Foot ToeBase Shoulder UpperArm LowerArm Hand Middle1", "J_Bip_{S}_{}",
+)  # fmt: skip
+MOCAPNET = rig("hip abdomen waist chest neck head", "hip knee foot bigtoe Collar shoulder elbow hand Mid1", "{s}{}")
+ROKOKO = rig(
+    "Hips Spine1 Spine2 Spine4 Neck Head",
+    "Thigh Shin Foot Toe Shoulder Arm ForeArm Hand Finger3Proximal", "{side}{}",
+)  # fmt: skip
 OWN = {name: name for name in JOINT_NAMES}
 
 

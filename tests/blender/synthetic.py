@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from support import tensor_files
 
 STENCIL = 5
@@ -36,26 +37,13 @@ def joints() -> np.ndarray:
 
 def random_rotations(rng: np.random.Generator, count: int) -> np.ndarray:
     """Rotations [count, 3, 3], uniform."""
-    q = rng.normal(size=(count, 4))
-    w, x, y, z = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
-    return np.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        -1,
-    ).reshape(count, 3, 3)  # fmt: skip
+    return Rotation.from_quat(rng.normal(size=(count, 4)), scalar_first=True).as_matrix()
 
 
 def axis_angle(vector: np.ndarray) -> np.ndarray:
-    """Rotations [..., 3, 3] of axis-angle vectors [..., 3] (Rodrigues)."""
+    """Rotations [..., 3, 3] of axis-angle vectors [..., 3]."""
     vector = np.asarray(vector, np.float64)
-    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(vector / np.maximum(angle[..., 0], 1e-12), -1, 0)
-    o = np.zeros_like(x)
-    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix().reshape(*vector.shape, 3)
 
 
 def skinning(rest_joints: np.ndarray, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:

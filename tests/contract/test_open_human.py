@@ -13,7 +13,7 @@ import pytest
 import torch
 from export_people import person
 from primdiffusion.body.model import default_body as backend_body
-from primdiffusion.editing.reshaping import reshaped as reshape_in_backend
+from primdiffusion.editing.reshaping import reshape_human as reshape_in_backend
 from primdiffusion.files import tensor_file
 from primdiffusion.human import Human, generate, place
 from primdiffusion.human_file import load_human, save_body, save_human

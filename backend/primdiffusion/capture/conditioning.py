@@ -15,7 +15,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.capture.dataset import stack
-from primdiffusion.capture.people_files import LARGEST_BETA
+from primdiffusion.capture.people_files import LARGEST_CAPTURED_BETA
 from primdiffusion.capture.reader import (
     CAMERAS_FILE,
     Captures,
@@ -39,7 +39,7 @@ SAME_BODY_M = 0.02
 LEAST_COVERED = 0.8
 """Fraction of the body inside the masks; dressed humans on the default body have more than 0.95."""
 _EACH = 20
-"""One in this many vertices of the body is projected."""
+"""Step between the vertices of the body that are projected."""
 _NAMED = 3
 
 
@@ -62,7 +62,7 @@ class CapturedPerson:
     whole_views: tuple[View, ...] = ()
     """Cameras of plain pictures, as found; those of `views` see squares cut out of them."""
     fit: Mapping[str, Any] | None = None
-    """How well the posture explains plain pictures, as posture.json holds it: `FitQuality.content`."""
+    """Quality of the posture in plain pictures, as posture.json holds it: `FitQuality.content`."""
     masks_made: tuple[UInt8[np.ndarray, "H W"], ...] = ()
     """Masks of whole pictures that had none, of upright pixels."""
 
@@ -200,10 +200,10 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
     )
     if body is not default_body():
         name, remedy = "encoder's body", "use captures that are fitted to the SMPL file that the encoder refers to"
-    if len(betas) > components or not (betas.abs() <= LARGEST_BETA).all():
+    if len(betas) > components or not (betas.abs() <= LARGEST_CAPTURED_BETA).all():
         raise ValueError(
             f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "
-            f"{components} of the {name}, within {LARGEST_BETA:g}: {remedy}"
+            f"{components} of the {name}, within {LARGEST_CAPTURED_BETA:g}: {remedy}"
         )
     distance = float(np.linalg.norm(joints_from_body(subject, body), axis=-1).max())
     if not distance <= SAME_BODY_M:

@@ -35,7 +35,7 @@ LARGEST_UV = 1e4
 SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 FARTHEST = 10.0
 """Largest distance of a vertex from the origin, metres; a stray vertex would move the cameras far away."""
-LARGEST_BETA = 20.0
+LARGEST_CAPTURED_BETA = 20.0
 """Standard deviations; larger betas put joints outside any body."""
 
 
@@ -129,8 +129,8 @@ def _betas(about: Any) -> Float[np.ndarray, "n"]:
     if about.get("body", "default") != "default":
         raise ValueError(f"it is rigged on the body {about['body']!r:.60}, not the default body")
     betas, components = np.asarray(about["betas"], np.float64), default_body().shape_basis.shape[-1]
-    if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
-        raise ValueError(f"its betas are not at most {components} numbers within {LARGEST_BETA:g} of 0")
+    if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_CAPTURED_BETA).all():
+        raise ValueError(f"its betas are not at most {components} numbers within {LARGEST_CAPTURED_BETA:g} of 0")
     return betas
 
 

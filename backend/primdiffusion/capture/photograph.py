@@ -50,7 +50,7 @@ class Photograph:
     rgba: UInt8[np.ndarray, "h w 4"]
     """The square around the person: sRGB over black, and the mask."""
     window: Window
-    """That square in the upright picture; it may reach beyond."""
+    """The square in the upright picture; it may reach beyond."""
     width: int
     """Width and height of the upright picture, pixels."""
     height: int

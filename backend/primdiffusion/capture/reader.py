@@ -364,25 +364,21 @@ def _coverage(picture: Image.Image) -> UInt8[np.ndarray, "H W"]:
 
 
 @contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Errors of an image file, as sentences that name it."""
+def _named(path: Path, reason: str = "is not a complete image") -> Iterator[None]:
+    """Errors of a file, as sentences that name it."""
     try:
         yield
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
-        raise FileError(path, f"is not a complete image ({e!s:.160})", "render it again") from e
+        raise FileError(path, f"{reason} ({e!s:.160})", "render the subject again") from e
 
 
 def _read_views(folder: Path) -> list[View]:
     """Read cameras.json; image sizes are not in it and come from the images."""
     path = folder / CAMERAS_FILE
-    try:
+    with _named(path, "cannot be read"):
         named = read_json(path)
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path} is missing: render the subject again") from None
-    except (OSError, ValueError) as e:
-        raise FileError(path, f"cannot be read ({e!s:.160})", "render the subject again") from e
     return capture_layout.views_in(named, path, lambda camera: _size(folder, camera))
 
 
@@ -391,9 +387,6 @@ def _size(folder: Path, camera: int) -> tuple[int, int]:
     for kind in ("img", "mask"):
         pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{capture_layout.ENDINGS[kind]}"))
         for path in pictures[:1]:
-            try:
-                with opened_picture(path, bytes_each=1) as picture:
-                    return picture.size
-            except (OSError, ValueError) as e:
-                raise FileError(path, f"is not a complete image ({e!s:.160})", "render it again") from e
+            with _named(path), opened_picture(path, bytes_each=1) as picture:
+                return picture.size
     raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")

@@ -15,7 +15,7 @@ from primdiffusion.commands.output import FILES, Decode, skips_previews, step_pr
 from primdiffusion.commands.progress import ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel, warnings_of
-from primdiffusion.editing.edit import OnStep, combined, with_payload
+from primdiffusion.editing.edit import OnStep, combine, with_payload
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import read_weights, region_from_weights, region_of
@@ -123,4 +123,4 @@ def _region(request: RegionRequest, human: Human) -> Bool[Tensor, "k"]:
 def _decode_inside(model: DiffusionModel, human: Human, region: Bool[Tensor, "k"], x0: Tensor) -> Human:
     """Return the human with a sampler's x0 guess decoded inside a region."""
     guess = with_payload(model, human, x0)
-    return dataclasses.replace(guess, payload=combined(region, guess.payload, human.payload))
+    return dataclasses.replace(guess, payload=combine(region, guess.payload, human.payload))

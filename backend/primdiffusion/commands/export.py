@@ -12,7 +12,7 @@ from primdiffusion.body.model import read_pose
 from primdiffusion.commands.options import ExportCommand
 from primdiffusion.commands.progress import EtaEstimator, ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
 from primdiffusion.export.merged_file import grid_writer, upright_grid, write_grid_npz
 from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb
@@ -104,4 +104,4 @@ def _placed(human: Human, person: PosedPerson) -> Primitives:
 
 def _shaped(human: Human, betas: list[float] | None) -> Human:
     """The human with other betas if given. Raises ValueError for a wrong number of them."""
-    return human if betas is None else reshaped(human, torch.tensor(betas, dtype=torch.float32))
+    return human if betas is None else reshape_human(human, torch.tensor(betas, dtype=torch.float32))

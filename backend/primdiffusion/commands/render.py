@@ -18,7 +18,7 @@ from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.drawing import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
 from primdiffusion.drawing import draw as draw_scene
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.files.arrays import read_numbers
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import atomic_path
@@ -110,7 +110,7 @@ class FrameDrawer:
         return place_skinned(human, self._tensor(joints), self._tensor(matrix), *self._body_and_anchors(file))
 
     def _reshape(self, file: Stamp, betas: Numbers) -> Human:
-        return reshaped(self._human(file), self._tensor(betas), *self._body_and_anchors(file))
+        return reshape_human(self._human(file), self._tensor(betas), *self._body_and_anchors(file))
 
     def _tensor(self, numbers: Numbers) -> torch.Tensor:
         return torch.tensor(numbers, dtype=torch.float32, device=self._device)

@@ -21,7 +21,7 @@ from primdiffusion.diffusion.schedule import Schedule
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
 
-def zeroed(layer: Layer) -> Layer:
+def zero_weights(layer: Layer) -> Layer:
     """Set weights and bias to 0, so that a residual block that ends in the layer starts as the identity."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
@@ -74,7 +74,7 @@ class LocalBlock(nn.Module):
         self.norm1, self.conv1 = nn.GroupNorm(8, channels), nn.Conv2d(channels, out_channels, 3, padding=1)
         self.norm2, self.conv2 = (
             nn.GroupNorm(8, out_channels),
-            zeroed(nn.Conv2d(out_channels, out_channels, 3, padding=1)),
+            zero_weights(nn.Conv2d(out_channels, out_channels, 3, padding=1)),
         )
         self.film = nn.Linear(condition_width, 2 * out_channels)
         self.skip = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
@@ -95,7 +95,7 @@ class LocalAttention(nn.Module):
         self.norm, self.qkv, self.out = (
             nn.GroupNorm(8, channels),
             nn.Conv2d(channels, 3 * channels, 1),
-            zeroed(nn.Conv2d(channels, channels, 1)),
+            zero_weights(nn.Conv2d(channels, channels, 1)),
         )
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
@@ -131,7 +131,7 @@ class LocalUNet(nn.Module):
         super().__init__()
         widths, condition_width = config.widths, config.condition_width
         self.time = TimeEmbedding(64, condition_width)
-        self.asked = zeroed(nn.Linear(asked_width, condition_width, bias=False)) if asked_width else None
+        self.asked = zero_weights(nn.Linear(asked_width, condition_width, bias=False)) if asked_width else None
         self.person = nn.Linear(components, condition_width)
         self.position = nn.Parameter(0.5 * torch.randn(config.position_channels, grid, grid))
         self.picture_channels = channels if picture_channels is None else picture_channels
@@ -151,7 +151,7 @@ class LocalUNet(nn.Module):
                 self.grow.append(nn.Conv2d(widths[level + 1], width, 1))
         self.norm, self.outer = (
             nn.GroupNorm(8, widths[0]),
-            zeroed(nn.Conv2d(widths[0], channels, config.end_kernel, padding="same")),
+            zero_weights(nn.Conv2d(widths[0], channels, config.end_kernel, padding="same")),
         )
 
     def forward(
@@ -163,7 +163,7 @@ class LocalUNet(nn.Module):
         condition: Float[Tensor, "b a"] | None = None,
     ) -> Float[Tensor, "b c h w"]:
         """Return the correction for a noisy rest, given denoised person components and their contribution `picture`."""
-        condition = functional.silu(embedded(self.time(t), self.asked, condition) + self.person(person))
+        condition = functional.silu(embed(self.time(t), self.asked, condition) + self.person(person))
         position = self.position.expand(noisy.shape[0], -1, -1, -1)  # len would fix the batch of an exported graph
         x = self.inner(
             torch.cat([noisy, picture[:, : self.picture_channels], position], dim=1).contiguous(
@@ -188,7 +188,7 @@ class LocalUNet(nn.Module):
         return x
 
 
-def embedded(
+def embed(
     time: Float[Tensor, "b e"], asked: nn.Linear | None, condition: Float[Tensor, "b a"] | None
 ) -> Float[Tensor, "b e"]:
     """Return the embedding of step and condition; None is the same as zeros: unconditional."""

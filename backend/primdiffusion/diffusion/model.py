@@ -211,7 +211,7 @@ class DiffusionModel:
         if wanted and isinstance(self.denoiser, PersonDenoiser):
             coefficients, _ = self.denoiser.prior.split(x0)
             features = (coefficients / self.denoiser.component_std)[:, :wanted]
-        return self.shapes.sample(features, [seeded(seed) for seed in seeds])
+        return self.shapes.sample(features, [seeded_generator(seed) for seed in seeds])
 
 
 def sample(
@@ -238,7 +238,7 @@ def sample(
     if not len(seeds):
         raise ValueError("no seeds were given: give one for each human")
     chain = model.chain(model.schedule.length, steps)
-    generators = [seeded(seed) for seed in seeds]
+    generators = [seeded_generator(seed) for seed in seeds]
     with fixed_threads(model.threads):
         conditions = model.complete(generators, condition)
         start = model.start(generators, chain[0], conditions)
@@ -251,7 +251,7 @@ def sample(
     return each_with_fixed_threads(steps_taken, model.threads)
 
 
-def seeded(seed: int) -> torch.Generator:
+def seeded_generator(seed: int) -> torch.Generator:
     """Return a CPU generator seeded with `seed`; ValueError unless 0 <= seed < 2^63.
 
     Always on the CPU: each kind of device has its own random number generator, and a seed should give one person.

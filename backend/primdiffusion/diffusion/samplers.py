@@ -19,7 +19,7 @@ from primdiffusion.diffusion.schedule import CLEAN, Schedule
 Denoise = Callable[[Tensor, int], Tensor]
 """x0 guess from a batch x [b, ...] that holds noise of step t."""
 Generators = torch.Generator | Sequence[torch.Generator]
-"""One for each sample of a batch, or one for the whole batch."""
+"""A generator for each sample of a batch, or one for the whole batch."""
 RELEASED_END = 0
 """The level at which the released code's DDIM ends: 0.01 of noise remains (SPEC 1.14)."""
 

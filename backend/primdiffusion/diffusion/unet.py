@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion.diffusion.denoiser import TimeEmbedding, zeroed
+from primdiffusion.diffusion.denoiser import TimeEmbedding, zero_weights
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ResidualBlock(nn.Module):
             nn.GroupNorm(32, out_channels),
             nn.SiLU(),
             nn.Identity(),
-            zeroed(nn.Conv2d(out_channels, out_channels, 3, padding=1)),
+            zero_weights(nn.Conv2d(out_channels, out_channels, 3, padding=1)),
         )
         same = channels == out_channels
         self.skip_connection = nn.Identity() if same else nn.Conv2d(channels, out_channels, 1)
@@ -136,7 +136,7 @@ class SpatialTransformer(nn.Module):
         self.norm = nn.GroupNorm(32, channels, eps=1e-6)
         self.proj_in = nn.Conv2d(channels, channels, 1)
         self.transformer_blocks = nn.ModuleList([TransformerBlock(channels, config.heads)])
-        self.proj_out = zeroed(nn.Conv2d(channels, channels, 1))
+        self.proj_out = zero_weights(nn.Conv2d(channels, channels, 1))
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The input plus what attention adds."""
@@ -213,7 +213,7 @@ class SlabUNet(nn.Module):
                     stage.append(Upsample(channels))
                 self.output_blocks.append(stage)
         self.out = nn.Sequential(
-            nn.GroupNorm(32, channels), nn.SiLU(), zeroed(nn.Conv2d(channels, config.slab_channels, 3, padding=1))
+            nn.GroupNorm(32, channels), nn.SiLU(), zero_weights(nn.Conv2d(channels, config.slab_channels, 3, padding=1))
         )
 
     def _stage(self, channels: int, out_channels: int, level: int) -> UNetStage:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep
 from primdiffusion.diffusion.schedule import early_steps
 from primdiffusion.human import Human
@@ -56,15 +56,15 @@ def check_correspondence(name: str, body_setup: BodySetup | None, other_name: st
         )
 
 
-def encoded(model: DiffusionModel, human: Human) -> Float[Tensor, "1 c h w"]:
+def encode_human(model: DiffusionModel, human: Human) -> Float[Tensor, "1 c h w"]:
     """Encode a human as a clean latent; `model` comes from `match_density`. Detail beyond the codec is lost."""
     return model.encode(human.payload.map(lambda values: values[None]))
 
 
 def edit_generator(seed: int) -> torch.Generator:
     """Return the noise generator of an edit. Raises ValueError for a seed outside 0 ... 2^63-1."""
-    seeded(seed)
-    return seeded(seed ^ EDIT_SEED_MASK)
+    seeded_generator(seed)
+    return seeded_generator(seed ^ EDIT_SEED_MASK)
 
 
 def kept_attributes(
@@ -113,14 +113,14 @@ def run_sampler(steps: Iterable[SamplerStep], on_step: OnStep | None) -> Float[T
     return final
 
 
-def decoded(model: DiffusionModel, x0: Float[Tensor, "1 c h w"]) -> Payload:
+def decode_latents(model: DiffusionModel, x0: Float[Tensor, "1 c h w"]) -> Payload:
     """Decode one clean latent to a payload on the CPU."""
     return model.decode(x0[0]).to("cpu")
 
 
 def with_payload(model: DiffusionModel, human: Human, x0: Float[Tensor, "1 c h w"]) -> Human:
     """Return the human with the payload of a clean latent, on the CPU: the preview of a running edit."""
-    return dataclasses.replace(human.to("cpu"), payload=decoded(match_density(model, human), x0))
+    return dataclasses.replace(human.to("cpu"), payload=decode_latents(match_density(model, human), x0))
 
 
 def with_edit(human: Human, edit: Mapping[str, Any], payload: Payload, betas: Tensor | None = None) -> Human:
@@ -132,7 +132,7 @@ def with_edit(human: Human, edit: Mapping[str, Any], payload: Payload, betas: Te
     ).validate()
 
 
-def combined(region: Tensor, inside: Payload, outside: Payload) -> Payload:
+def combine(region: Tensor, inside: Payload, outside: Payload) -> Payload:
     """Combine two payloads: `inside` in the region [K], `outside`, bit for bit, elsewhere; on the CPU."""
 
     def chosen(name: str) -> Tensor:
@@ -147,7 +147,7 @@ def difference(one: Payload, other: Payload) -> Payload:
     return Payload(one.rgb - other.rgb, one.density - other.density, one.delta_scale - other.delta_scale)
 
 
-def added(payload: Payload, residual: Payload, factor: float) -> Payload:
+def add_residual(payload: Payload, residual: Payload, factor: float) -> Payload:
     """Add `factor` * `residual`, clamped to the bounds of payloads."""
     return Payload(
         (payload.rgb + factor * residual.rgb).clamp(0, 1),

@@ -19,12 +19,12 @@ from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, ga
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
 from primdiffusion.editing.edit import (
     OnStep,
-    combined,
+    combine,
     conditional_denoiser,
-    decoded,
+    decode_latents,
     edit_generator,
     edit_timesteps,
-    encoded,
+    encode_human,
     kept_attributes,
     match_density,
     run_sampler,
@@ -32,7 +32,7 @@ from primdiffusion.editing.edit import (
 )
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.formats import requests
-from primdiffusion.human import Human, made_by
+from primdiffusion.human import Human, model_provenance
 from primdiffusion.runtime.device import on_fixed_threads
 
 RESAMPLES = 2
@@ -58,15 +58,15 @@ def repaint(
     steps[0], is used. The last x0 equals `known` outside.
     """
     moves = [move for move in pairwise(steps) for _ in range(resamples)] + [(steps[-1], CLEAN)]
-    x = torch.where(inside, x, noised(schedule, known, steps[0], generator))
+    x = torch.where(inside, x, add_noise(schedule, known, steps[0], generator))
     for index, (t, t_next) in enumerate(moves):
         if index and moves[index - 1] == (t, t_next):
-            x = renoised(schedule, x, t_next, t, generator)
+            x = renoise(schedule, x, t_next, t, generator)
         x0 = torch.where(inside, denoise(x, t), known)
         x = schedule.posterior_mean(x, x0, t, t_next)
         if t_next != CLEAN:
             x = x + schedule.posterior_std(t, t_next) * gaussian_noise(x, generator)
-        x = torch.where(inside, x, noised(schedule, known, t_next, generator))
+        x = torch.where(inside, x, add_noise(schedule, known, t_next, generator))
         yield SamplerStep(index, len(moves), t, x0, x)
 
 
@@ -88,11 +88,11 @@ def paste_after_steps(
     for index, (t, t_next) in enumerate(pairwise((*steps, CLEAN))):
         x0 = denoise(x, t)
         x = ddpm_step(schedule, x, x0, t, t_next, generator)
-        x = torch.where(inside, x, noised(schedule, known, t, generator))
+        x = torch.where(inside, x, add_noise(schedule, known, t, generator))
         yield SamplerStep(index, len(steps), t, torch.where(inside, x0, known), x)
 
 
-def noised(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: torch.Generator) -> Tensor:
+def add_noise(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: torch.Generator) -> Tensor:
     """Noise clean latents to level t; unchanged for `CLEAN`."""
     if t == CLEAN:
         return x0
@@ -100,7 +100,7 @@ def noised(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: 
     return schedule.q_sample(x0, level, gaussian_noise(x0, generator))
 
 
-def renoised(schedule: Schedule, x: Float[Tensor, "b c h w"], t: int, t_up: int, generator: torch.Generator) -> Tensor:
+def renoise(schedule: Schedule, x: Float[Tensor, "b c h w"], t: int, t_up: int, generator: torch.Generator) -> Tensor:
     """Noise latents of level t to the higher level t_up: a sample of q(x_up | x)."""
     ratio = schedule.signal(t_up) / schedule.signal(t)
     return ratio * x + (1 - ratio**2) ** 0.5 * gaussian_noise(x, generator)
@@ -150,13 +150,13 @@ def inpaint(
     chain = model.chain(model.schedule.length, steps)
     model = match_density(model, human)
     denoise = conditional_denoiser(model, attributes, guidance)
-    known, inside = encoded(model, human), model.cell_mask(region)
+    known, inside = encode_human(model, human), model.cell_mask(region)
     start = start_like(model, known, inside, chain[0], model.condition(attributes), generator)
     sampler = MASKED_SAMPLERS[masking](denoise, model.schedule, start, known, inside, chain, generator)
     x0 = run_sampler(sampler, on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
-    edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
-    return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
+    edit = {**edit, "masking": masking, "attributes": dict(attributes), "guidance": guidance, **model_provenance(model)}
+    return with_edit(human, edit, combine(region, decode_latents(model, x0), human.payload))
 
 
 def start_like(
@@ -175,7 +175,7 @@ def start_like(
         return model.start([generator], t, condition)
     draws = model.denoiser.prior.sample(DRAWS, generator, None if condition is None else condition[None])
     distance = (draws - known).square().masked_fill(inside, 0).sum((1, 2, 3))
-    return noised(model.schedule, draws[distance.argmin()][None], t, generator)
+    return add_noise(model.schedule, draws[distance.argmin()][None], t, generator)
 
 
 @on_fixed_threads
@@ -201,11 +201,11 @@ def harmonise(
     chain = edit_timesteps(model, amount, steps)
     payload = human.payload
     if chain:
-        known, inside = encoded(model, human), model.cell_mask(region)
-        start = noised(model.schedule, known, chain[0], generator)
+        known, inside = encode_human(model, human), model.cell_mask(region)
+        start = add_noise(model.schedule, known, chain[0], generator)
         denoise = conditional_denoiser(model, kept_attributes(model, human, known, {}), guidance=1.0)
         x0 = run_sampler(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
-        payload = combined(region, decoded(model, x0), human.payload)
+        payload = combine(region, decode_latents(model, x0), human.payload)
     edit = {
         "edit": "harmonise",
         "region": name_region(region, human.body_setup),
@@ -213,4 +213,4 @@ def harmonise(
         "seed": seed,
         "steps": steps,
     }
-    return with_edit(human, {**edit, **made_by(model)}, payload)
+    return with_edit(human, {**edit, **model_provenance(model)}, payload)

@@ -16,17 +16,17 @@ from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddim
 from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.editing.edit import (
     OnStep,
-    added,
+    add_residual,
     check_unit_interval,
-    decoded,
+    decode_latents,
     difference,
-    encoded,
+    encode_human,
     match_density,
     run_sampler,
     with_edit,
 )
 from primdiffusion.formats import requests
-from primdiffusion.human import Human, made_by
+from primdiffusion.human import Human, model_provenance
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.runtime.device import on_fixed_threads
 
@@ -67,7 +67,7 @@ def interpolate(
     near, far = (a, b) if fraction <= 0.5 else (b, a)
     edit = {"edit": "interpolate", "with": dict(far.provenance), "fraction": min(fraction, 1 - fraction)}
     betas = torch.lerp(a.betas.cpu(), b.betas.cpu(), fraction)
-    return with_edit(near, {**edit, "steps": steps, **made_by(model)}, payload, betas)
+    return with_edit(near, {**edit, "steps": steps, **model_provenance(model)}, payload, betas)
 
 
 def inversion_steps(schedule: Schedule, steps: int) -> list[int]:
@@ -80,7 +80,7 @@ def inversion_steps(schedule: Schedule, steps: int) -> list[int]:
     return [round((schedule.length - 1) * (1 - i / (steps - 1))) for i in range(steps)]
 
 
-def inverted(
+def invert(
     denoise: Denoise, schedule: Schedule, x0: Float[Tensor, "b c h w"], steps: Sequence[int]
 ) -> Iterator[SamplerStep]:
     """DDIM inversion: from clean latents, assigned to the last of the descending `steps`, up to the first."""
@@ -105,7 +105,7 @@ def invert_and_sample(
 ) -> Iterator[SamplerStep]:
     """Invert both ends, then denoise both and their interpolation; the last x0 is that of [a, b, between]."""
     noise, total, up = ends, 2 * len(steps) - 1, 0
-    for step in inverted(denoise, schedule, ends, steps):
+    for step in invert(denoise, schedule, ends, steps):
         yield dataclasses.replace(step, total=total)
         noise, up = step.x, up + 1
     start = torch.cat([noise, slerp(noise[0], noise[1], fraction)[None]])
@@ -116,7 +116,7 @@ def invert_and_sample(
 def _between(
     model: DiffusionModel, people: tuple[Human, Human], fraction: float, chain: Sequence[int], on_step: OnStep | None
 ) -> Payload:
-    ends = torch.cat([encoded(model, human) for human in people])
+    ends = torch.cat([encode_human(model, human) for human in people])
     of_ends = model.read_condition(ends)
     condition = None if of_ends is None else torch.cat([of_ends, of_ends[int(fraction > 0.5)][None]])
 
@@ -125,8 +125,9 @@ def _between(
 
     back = run_sampler(invert_and_sample(denoise, model.schedule, ends, fraction, chain), on_step)
     latent_residual = ends - back[:2]
-    between = decoded(model, back[2:] + torch.lerp(latent_residual[:1], latent_residual[1:], fraction))
+    between = decode_latents(model, back[2:] + torch.lerp(latent_residual[:1], latent_residual[1:], fraction))
     residuals = [
-        difference(human.payload.to("cpu"), decoded(model, x0[None])) for human, x0 in zip(people, ends, strict=True)
+        difference(human.payload.to("cpu"), decode_latents(model, x0[None]))
+        for human, x0 in zip(people, ends, strict=True)
     ]
-    return added(added(between, residuals[0], 1 - fraction), residuals[1], fraction)
+    return add_residual(add_residual(between, residuals[0], 1 - fraction), residuals[1], fraction)

@@ -96,16 +96,17 @@ def region_of(names: Sequence[str], body_setup: BodySetup | None = None) -> Bool
     return torch.stack([parts[name] for name in names]).any(0)
 
 
-def region_from_weights(
-    weights: Float[Tensor, "v"], threshold: float = 0.5, body_setup: BodySetup | None = None
-) -> Bool[Tensor, "k"]:
-    """Return the primitives whose mean painted weight is at least `threshold`.
+PAINTED = 0.5
+"""Mean weight from which a primitive is painted."""
+
+
+def region_from_weights(weights: Float[Tensor, "v"], body_setup: BodySetup | None = None) -> Bool[Tensor, "k"]:
+    """Return the primitives whose mean painted weight is at least PAINTED.
 
     `weights` holds a number from 0 to 1 for each vertex of the body, in its order (a vertex group in
     Blender). The mean is over the primitive's 8 x 8 texels; on a body other than the default one, at its anchor.
 
-    Raises ValueError for a wrong number of vertices, values that are not finite, a threshold outside (0, 1], and a
-    region without primitives.
+    Raises ValueError for a wrong number of vertices, values that are not finite, and a region without primitives.
     """
     body = default_body() if body_setup is None else body_setup.body
     if tuple(weights.shape) != (len(body.template),):
@@ -113,15 +114,12 @@ def region_from_weights(
         raise ValueError(f"the painted weights have shape {given}: give one number for each of the {wanted} vertices")
     if not torch.isfinite(weights).all():
         raise ValueError("the painted weights contain NaN or infinite values: paint them again")
-    if not 0 < threshold <= 1:
-        raise ValueError(f"the threshold is {threshold}: choose a number above 0 and at most 1")
     covered = _covered(weights.float().cpu(), body_setup)
-    # Weights painted at exactly the threshold average to slightly less, by rounding.
-    region = covered >= threshold - 1e-6
+    region = covered >= PAINTED - 1e-6  # weights painted at exactly this average to slightly less, by rounding
     if not region.any():
         raise ValueError(
-            f"the painted region covers no primitive (mean weight at most {float(covered.max()):.2f}, threshold "
-            f"{threshold}): paint a larger area, or with more strength"
+            f"the painted region covers no primitive (mean weight at most {float(covered.max()):.2f}, {PAINTED} is "
+            "needed): paint a larger area, or with more strength"
         )
     return region
 

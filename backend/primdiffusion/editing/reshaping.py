@@ -25,7 +25,7 @@ SAME_BETAS = 1e-5
 """Tolerance within which betas count as equal."""
 
 
-def reshaped(
+def reshape_human(
     human: Human, betas: Float[Tensor, "n"], body: BodyModel | None = None, anchors: Anchors | None = None
 ) -> Human:
     """Return the human with other betas, its delta scales multiplied by `box_growth`; density is unchanged.

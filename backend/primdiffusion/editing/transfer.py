@@ -7,7 +7,7 @@ import dataclasses
 from jaxtyping import Bool
 from torch import Tensor
 
-from primdiffusion.editing.edit import check_correspondence, combined, with_edit
+from primdiffusion.editing.edit import check_correspondence, combine, with_edit
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.human import Human
 from primdiffusion.primitives.primitives import Payload
@@ -48,4 +48,4 @@ def _transferred(name: str, source: Human, target: Human, region: Tensor, payloa
     region = check_region(region)
     check_correspondence("the source", source.body_setup, "the target", target.body_setup)
     edit = {"edit": name, "region": name_region(region, target.body_setup), "source": dict(source.provenance)}
-    return with_edit(target, edit, combined(region, payload, target.payload))
+    return with_edit(target, edit, combine(region, payload, target.payload))

@@ -11,20 +11,20 @@ from primdiffusion.diffusion.model import DiffusionModel, unfollowed
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
     OnStep,
-    added,
+    add_residual,
     conditional_denoiser,
-    decoded,
+    decode_latents,
     difference,
     edit_generator,
     edit_timesteps,
-    encoded,
+    encode_human,
     kept_attributes,
     match_density,
     run_sampler,
     with_edit,
 )
 from primdiffusion.formats import requests
-from primdiffusion.human import Human, made_by
+from primdiffusion.human import Human, model_provenance
 from primdiffusion.runtime.device import on_fixed_threads
 
 
@@ -73,18 +73,18 @@ def vary_batch(
     chain = edit_timesteps(model, amount, steps)
     payloads, missed = [human.payload.to("cpu")] * len(seeds), [{}] * len(seeds)
     if chain:
-        x0 = encoded(model, human)
+        x0 = encode_human(model, human)
         denoise = conditional_denoiser(model, kept_attributes(model, human, x0, attributes), guidance)
-        residual = difference(payloads[0], decoded(model, x0))
+        residual = difference(payloads[0], decode_latents(model, x0))
         clean = x0.expand(len(seeds), *x0.shape[1:])
         level = torch.full((len(seeds),), chain[0], device=x0.device)
         x = model.schedule.q_sample(clean, level, gaussian_noise(clean, generators))
         varied = run_sampler(ddim(denoise, model.schedule, x, chain, generators), on_step)
         signal = model.schedule.signal(chain[0])
-        payloads = [added(decoded(model, one[None]), residual, signal) for one in varied]
+        payloads = [add_residual(decode_latents(model, one[None]), residual, signal) for one in varied]
         missed = [{"unfollowed": names} if names else {} for names in unfollowed(model, varied, attributes)]
     edit = {"edit": "vary", "amount": amount}
-    shared = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
+    shared = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **model_provenance(model)}
     return [
         with_edit(human, {**edit, "seed": seed, **shared, **names}, payload)
         for seed, payload, names in zip(seeds, payloads, missed, strict=True)

@@ -76,7 +76,7 @@ WholeNormConv: Conv = functools.partial(UntiedConv, whole_norm=True)
 """The released code's convolution."""
 
 
-def rectified(x: Tensor) -> Tensor:
+def rectify(x: Tensor) -> Tensor:
     """Leaky ReLU."""
     return functional.leaky_relu(x, SLOPE)
 
@@ -92,7 +92,7 @@ class ResidualConv(nn.Module):
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Output of the same size, after the activation."""
-        return rectified(self.second(rectified(self.first(x))) + self.shortcut(x))
+        return rectify(self.second(rectify(self.first(x))) + self.shortcut(x))
 
 
 class ReleasedResidualConv(nn.Module):
@@ -106,7 +106,7 @@ class ReleasedResidualConv(nn.Module):
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Output of the same size."""
-        return rectified(self.second(rectified(self.first(x)))) + self.shortcut(x)
+        return rectify(self.second(rectify(self.first(x)))) + self.shortcut(x)
 
 
 class GridNetwork(nn.Module):
@@ -127,10 +127,10 @@ class GridNetwork(nn.Module):
         """Features of the grid, not rectified."""
         levels = [self.enter(x)]
         for down in self.down:
-            levels.append(rectified(down(levels[-1])))
+            levels.append(rectify(down(levels[-1])))
         value = levels.pop()
         for up in self.up:
-            value = rectified(up(value)) + levels.pop()
+            value = rectify(up(value)) + levels.pop()
         return self.leave(torch.cat([value, x], dim=1))
 
 
@@ -156,12 +156,12 @@ class HalvingGridNetwork(nn.Module):
         """Features of the grid, not rectified."""
         levels = [x]
         for down in self.down:
-            levels.append(rectified(down(levels[-1])))
+            levels.append(rectify(down(levels[-1])))
         value = levels.pop()
         for up in self.up[:-1]:
-            value = rectified(up(value)) + levels.pop()
+            value = rectify(up(value)) + levels.pop()
         for up in self.up[-1:]:
-            value = torch.cat([rectified(up(value)), x], dim=1)
+            value = torch.cat([rectify(up(value)), x], dim=1)
         return self.leave(value)
 
 

@@ -19,8 +19,8 @@ class EncoderConfig(Checked):
     """Architecture of the encoder (paper sec. 3.2; SPEC 2)."""
 
     appearance: Literal["voxels", "texels", "texture"] = "voxels"
-    """Where images are sampled: on the body surface at each texel (paper), at each voxel of the boxes, or as a texture
-    of 512 x 512 texels, resized to 256 x 256 (SPEC 2)."""
+    """Place where images are sampled: on the body surface at each texel (paper), at each voxel of the boxes, or as a
+    texture of 512 x 512 texels, resized to 256 x 256 (SPEC 2)."""
     masks: Literal["whole", "eroded"] = "whole"
     """eroded: images and masks lose the pixels within one of the mask's outline, as in the released code's training."""
     unseen: Literal["filled", "black"] = "filled"
@@ -35,7 +35,7 @@ class EncoderConfig(Checked):
     frames: Literal["person", "template"] = "person"
     """The body that carries the boxes: the subject's, or the mean shape (the paper's ablation "w/o R, T")."""
     base: Literal["looked_up", "constant"] = "looked_up"
-    """What the networks' output is added to: the value sampled at each voxel, or a constant (paper)."""
+    """Values to which the networks' output is added: the one sampled at each voxel, or a constant (paper)."""
     detail: Literal["skips", "bottleneck"] = "skips"
     """skips: mapping networks also get the image encoder's finer levels; bottleneck: the 32 x 32 features (paper)."""
     compat: Literal["none", "released"] = "none"
@@ -71,7 +71,7 @@ class EncoderConfig(Checked):
     scale: tuple[int, ...] = (64, 64)
     """Channels of the delta-scale network."""
     scale_outputs: Annotated[int, Range(3)] = 3
-    """Its output channels; only the last three are used: the released code has six unused ones before (SPEC 1.7)."""
+    """Output channels; only the last three are used: the released code has six unused ones before (SPEC 1.7)."""
     extent: tuple[float, float, float] = (0.85, 0.85, 0.45)
     """Initial delta scales along T, B, N: the anchors' boxes are large enough for loose clothing, and most of a human
     is sharper with smaller ones."""
@@ -83,7 +83,7 @@ class EncoderConfig(Checked):
     colour_gain: float = 0.06
     """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not compensate for wrong densities."""
     density_gain: float = 0.25
-    """As `colour_gain`, for relative densities."""
+    """Same as `colour_gain`, for relative densities."""
     full_density: float = 100.0
     """1/m: the density that corresponds to a relative density of 1."""
 

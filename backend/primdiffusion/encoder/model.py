@@ -26,7 +26,7 @@ from primdiffusion.diffusion.checkpoint import (
 )
 from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
-from primdiffusion.encoder.texture import eroded, unproject_texture
+from primdiffusion.encoder.texture import erode, unproject_texture
 from primdiffusion.encoder.unproject import Unprojected, extents_of_hull, unproject_texels, unproject_voxels
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.tensor_file import load_network, save, under
@@ -96,7 +96,7 @@ def unproject_views(
         )
     vertices, frames = frames_of(config, betas, views.pose, body_setup)
     if config.masks == "eroded":
-        views = eroded(views)
+        views = erode(views)
     extent = torch.tensor(config.extent).repeat(K, 1)
     if config.appearance == "texture":
         return dataclasses.replace(unproject_texture(views, vertices, body), extent=extent)

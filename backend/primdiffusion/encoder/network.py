@@ -20,7 +20,7 @@ from primdiffusion.encoder.blocks import (
     ResidualConv,
     UntiedConv,
     WholeNormConv,
-    rectified,
+    rectify,
 )
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.unproject import SIDE, Unprojected
@@ -96,7 +96,7 @@ class Encoder(nn.Module):
         x, base = self.read(found)
         fine = [x]
         for stem in self.stem:
-            fine.append(rectified(stem(fine[-1])))
+            fine.append(rectify(stem(fine[-1])))
         config = self.config
         appearance = self.appearance(fine[3])
         if config.grid_gain != 1:
@@ -111,7 +111,7 @@ class Encoder(nn.Module):
         density = clamp(base[:, 3 * S :] + config.density_gain * self.density(fused, fine))
         value = fused
         for layer in self.scale:
-            value = rectified(layer(value))
+            value = rectify(layer(value))
         logarithm = config.scale_gain * self.scale_out(value)[:, -3:]
         if config.delta_scale == "shared":
             logarithm = logarithm.mean((-1, -2), keepdim=True).expand_as(logarithm)
@@ -187,10 +187,10 @@ class MappingNetwork(nn.Module):
         """`fine` holds the image encoder's levels, starting with its input; used only with skips."""
         first, second, third = self.up
         if self.skips is None or self.out is None:
-            return third(rectified(second(rectified(first(fused)))))
-        value = rectified(first(fused) + self.skips[0](fine[2]))
-        value = rectified(second(value) + self.skips[1](fine[1]))
-        return self.out(rectified(third(value))) + self.skips[2](fine[0])
+            return third(rectify(second(rectify(first(fused)))))
+        value = rectify(first(fused) + self.skips[0](fine[2]))
+        value = rectify(second(value) + self.skips[1](fine[1]))
+        return self.out(rectify(third(value))) + self.skips[2](fine[0])
 
 
 def voxels(picture: Float[Tensor, "b dc 256 256"], channels: int) -> Float[Tensor, "b k c 8 8 8"]:

@@ -31,7 +31,7 @@ BESIDE = -0.001
 """Depth of pixels beside the body, metres: -1 in the released code's millimetres."""
 
 
-def eroded(views: Views) -> Views:
+def erode(views: Views) -> Views:
     """Set pixels to black, and their mask to 0, where the mask is 0 at the pixel or one of its eight neighbours."""
     rgba = views.rgba
     outside = (rgba[..., 3] == 0).float()

@@ -158,10 +158,8 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
     return network.eval().requires_grad_(False)
 
 
-def correct_joints(
-    found: Float[Tensor, "k 2"], true: Float[Tensor, "k 2"], head_size: float, share: float = PCK_SHARE
-) -> Bool[Tensor, "k"]:
-    """Whether each joint is within `share` of the head size of the true one (PCKh, Andriluka et al. 2014).
+def correct_joints(found: Float[Tensor, "k 2"], true: Float[Tensor, "k 2"], head_size: float) -> Bool[Tensor, "k"]:
+    """Whether each joint is within PCK_SHARE of the head size of the true one (PCKh, Andriluka et al. 2014).
 
     Raises ValueError for different shapes or a head size that is not positive.
     """
@@ -169,7 +167,7 @@ def correct_joints(
         raise ValueError(f"joints have shapes {tuple(found.shape)} and {tuple(true.shape)}: give two of [k, 2]")
     if not head_size > 0:
         raise ValueError(f"the head size is {head_size} pixels: give the distance of two joints of the head")
-    return (found - true).norm(dim=-1) <= share * head_size
+    return (found - true).norm(dim=-1) <= PCK_SHARE * head_size
 
 
 def depth_error(

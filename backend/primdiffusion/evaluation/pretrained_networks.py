@@ -149,7 +149,7 @@ def load_matching(network: nn.Module, weights: Mapping[str, Tensor], what: str, 
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
 
 
-def resized(pictures: Float[Tensor, "n h w 3"], side: int) -> Float[Tensor, "n 3 side side"]:
+def resize(pictures: Float[Tensor, "n h w 3"], side: int) -> Float[Tensor, "n 3 side side"]:
     """Pictures of side x side pixels, bilinear between the two nearest pixels from the corner of each, as TensorFlow 1
     and torch-fidelity resize them."""
     x = pictures.movedim(-1, 1)
@@ -179,12 +179,12 @@ class NormalisedConvolution(nn.Module):
         return functional.relu(self.bn(self.conv(x)))
 
 
-def average_pooled(x: Tensor) -> Tensor:
+def average_pool(x: Tensor) -> Tensor:
     """3 x 3 average pooling without the padding."""
     return functional.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
 
 
-def max_pooled(x: Tensor) -> Tensor:
+def max_pool(x: Tensor) -> Tensor:
     """3 x 3 max pooling, for the last block."""
     return functional.max_pool2d(x, 3, 1, 1)
 
@@ -197,7 +197,7 @@ class InceptionBlock(nn.Module):
         channels: int,
         branches: Mapping[str, Sequence[Layer]],
         pooled: int | None,
-        pooling: Callable[[Tensor], Tensor] = average_pooled,
+        pooling: Callable[[Tensor], Tensor] = average_pool,
     ) -> None:
         """Build it; `pooled` are the channels of the pooling branch, None in blocks that halve width and height."""
         super().__init__()
@@ -265,12 +265,12 @@ class Inception(nn.Module):
             "branch3x3": [(384, 1), (384, (1, 3), (3, 1))],
             "branch3x3dbl": [(448, 1), (384, 3), (384, (1, 3), (3, 1))],
         }
-        self.Mixed_7b, self.Mixed_7c = InceptionBlock(1280, wide, 192), InceptionBlock(2048, wide, 192, max_pooled)
+        self.Mixed_7b, self.Mixed_7c = InceptionBlock(1280, wide, 192), InceptionBlock(2048, wide, 192, max_pool)
         self.requires_grad_(False).eval()
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 2048"]:
         """Features of sRGB-encoded pictures in [0, 1]."""
-        x = (255 * resized(pictures, self.SIDE) - 128) / 128  # of bytes, as in the TensorFlow graph
+        x = (255 * resize(pictures, self.SIDE) - 128) / 128  # of bytes, as in the TensorFlow graph
         x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
         x = self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(functional.max_pool2d(x, 3, 2)))
         x = functional.max_pool2d(x, 3, 2)
@@ -318,7 +318,7 @@ class ClipVision(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 512"]:
         """Features of sRGB-encoded square pictures in [0, 1]."""
-        x = resized(pictures, self.SIDE)
+        x = resize(pictures, self.SIDE)
         mean, std = (x.new_tensor(values)[:, None, None] for values in (self.MEAN, self.STD))
         patches = self.conv1((x - mean) / std).flatten(2).mT
         first = self.class_embedding.expand(len(x), 1, -1)

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy import ndimage, sparse, spatial
 from torch import Tensor
 
-from primdiffusion.export.simplify import simplified_and_unwrapped
+from primdiffusion.export.simplify import simplify_and_unwrap
 from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.files.whole_files import atomic_path
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -103,7 +103,7 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     grid = merge(primitives, settings.spacing, points=1)
     fine = outside_surface(grid, lambda: on_stage("surface", 0, 3))
     *coarse, corner_uv = run_in_process(
-        simplified_and_unwrapped,
+        simplify_and_unwrap,
         *fine,
         settings.triangles,
         settings.texture_px,

@@ -19,15 +19,15 @@ CHART_COST = 8.0
 """Maximum cost of a chart; xatlas's default of 2 cuts noisy surfaces into many more charts."""
 
 
-def simplified_and_unwrapped(
+def simplify_and_unwrap(
     vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], triangles: int, texture_px: int
 ) -> tuple[Float64[Array, "w 3"], Int64[Array, "g 3"], Float64[Array, "g 3 2"]]:
-    """Vertices, triangles and texture coordinates of the corners: `simplified`, then `unwrapped`."""
-    coarse = simplified(vertices, faces, triangles)
-    return (*coarse, unwrapped(*coarse, texture_px))
+    """Vertices, triangles and texture coordinates of the corners: `simplify`, then `unwrap`."""
+    coarse = simplify(vertices, faces, triangles)
+    return (*coarse, unwrap(*coarse, texture_px))
 
 
-def simplified(
+def simplify(
     vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], triangles: int
 ) -> tuple[Float64[Array, "w 3"], Int64[Array, "g 3"]]:
     """Simplify a closed mesh to at most `triangles` triangles by quadric edge collapse (libigl)."""
@@ -37,7 +37,7 @@ def simplified(
     return np.asarray(coarse), np.asarray(corners)
 
 
-def unwrapped(vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], texture_px: int) -> Float64[Array, "f 3 2"]:
+def unwrap(vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], texture_px: int) -> Float64[Array, "f 3 2"]:
     """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises MissingPackageError."""
     xatlas = optional_package("xatlas", missing=NO_XATLAS)
     atlas, charts, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()

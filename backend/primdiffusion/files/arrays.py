@@ -80,7 +80,7 @@ def read_arrays(
 def read_numbers(
     path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
 ) -> dict[str, NDArray]:
-    """As `read_arrays`; also raises FileError for arrays that are not finite numbers."""
+    """Same as `read_arrays`; also raises FileError for arrays that are not finite numbers."""
     arrays = read_arrays(path, required, optional, most_values=most_values)
     for name, values in arrays.items():
         if values.dtype.kind not in "biuf":

@@ -35,7 +35,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_message(text: str | bytes) -> Any:
-    """As `parse_json`, with numbers that may be NaN or infinite, for readers that name the faulty parameter."""
+    """Same as `parse_json`, with numbers that may be NaN or infinite, for readers that name the faulty parameter."""
     return _checked(_parsed(text), finite=False)
 
 

@@ -27,7 +27,7 @@ MOST_OPERATIONS, BYTES_AN_OPERATION = 300_000, 8
 LARGEST_UNPACKED = 256 * 2**20
 """Bytes of a compressed file, unpacked."""
 MOST_NUMBERS = 10_000_000
-"""In sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
+"""Largest number of values of sparse matrices, as they become dense; the regressor of SMPL's joints has 165,360."""
 MOST_LISTED = 2_000_000
 """Numbers in lists, each of which is visited; SMPL's arrays are not lists."""
 MAX_NESTING = 8

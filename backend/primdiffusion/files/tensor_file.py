@@ -17,19 +17,19 @@ from torch.overrides import TorchFunctionMode
 from primdiffusion.files.arrays import LARGEST_NUMBER
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import open_regular
+from primdiffusion.files.tensor_layout import LARGEST_HEADER, LENGTH_BYTES
 
 LARGEST_FILE = 16 * 2**30
-LENGTH_BYTES = 8
-"""Size of the header's length at the start of a file, and what the header is padded to a multiple of."""
-LARGEST_HEADER = 4 * 2**20
-"""Largest header, bytes: names and shapes take many times as much in memory."""
+"""Largest file of a network or of a training state, bytes."""
 _TYPES = (
     torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16, torch.int8,
     torch.uint8, torch.bool,
 )  # fmt: skip
 _TENSOR_FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
-_COPIES, _SMALL = 2, 100_000
-"""Layers with weight normalisation make their weights twice; networks count and place with small tensors."""
+_MOST_COPIES = 2
+"""Times that a network makes a parameter: twice in layers with weight normalisation."""
+_OTHER_VALUES = 100_000
+"""Values of tensors with which a network counts and places."""
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -114,7 +114,7 @@ class ParameterLimit(TorchFunctionMode):
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self._left = _COPIES * sum(values.numel() for values in tensors.values()) + _SMALL
+        self._left = _MOST_COPIES * sum(values.numel() for values in tensors.values()) + _OTHER_VALUES
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Count the values of a new tensor before it takes memory."""

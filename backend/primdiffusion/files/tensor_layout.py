@@ -46,7 +46,7 @@ class TensorLayout:
     """The content of a header."""
 
     tensors: dict[str, StoredTensor]
-    """In the order of their data, which they cover without holes or overlaps."""
+    """Tensors in the order of their data, which they cover without holes or overlaps."""
     metadata: dict[str, str]
     data_start: int
     """Offset of the data from the start of the file."""

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from primdiffusion.files.regular_files import FileError, open_regular
+from primdiffusion.files.tensor_file import LARGEST_FILE
 
-LARGEST_FILE = 16 * 2**30
 LARGEST_PICKLE = 8 * 2**20
 """Largest pickle in an archive, bytes; its numbers are not in it. A state dict needs some 100 bytes a tensor."""
 _ZIP_MAGIC = b"PK\x03\x04"

@@ -123,7 +123,7 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
         remove_abandoned(target)
         aside.mkdir()
         yield aside
-        publish(aside, target)
+        move_into_place(aside, target)
         made = []
     except OSError as e:
         if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
@@ -137,7 +137,7 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
                 path.rmdir()
 
 
-def publish(made: Path, folder: Path) -> None:
+def move_into_place(made: Path, folder: Path) -> None:
     """Move the content of a folder into another of the same disk: files replace files, and folders folders.
 
     Raises OSError; IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.

@@ -1,4 +1,4 @@
-"""What the child sends: answers to the requests of `requests`, errors, and notifications. Each is declared here, once.
+"""Messages of the child: answers to the requests of `requests`, errors, and notifications. Each is declared here, once.
 
 Fields without a default are those that the extension needs; it reads the answers of other versions too.
 """
@@ -36,14 +36,14 @@ class HumanAnswer(Open):
     """Kind of the edit; None for a new human."""
 
     def __str__(self) -> str:
-        """As the command line prints it."""
+        """Format for the command line."""
         made = f"seed {self.seed}, {self.steps} steps" if self.edit is None else self.edit
         return f"{self.person.parent}  {made}, {self.seconds:.1f} s"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VariationFiles(Open):
-    """One of several humans."""
+    """Files of one of several humans."""
 
     seed: Count
     person: Path
@@ -66,7 +66,7 @@ class ReconstructAnswer(HumanAnswer):
     """Further humans of the same pictures, seen from behind."""
 
     def __str__(self) -> str:
-        """As the command line prints it."""
+        """Format for the command line."""
         seen = (
             "pictures" if self.subject is None else f"{self.subject}, frame {self.frame}, {len(self.views or ())} views"
         )
@@ -115,7 +115,7 @@ class RenderAnswer(Open):
     seconds: Seconds | None = None
 
     def __str__(self) -> str:
-        """As the command line prints it."""
+        """Format for the command line."""
         return str(self.out)
 
 
@@ -193,7 +193,7 @@ class HelloAnswer(Ready):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CancelAnswer(Open):
-    """Whether the request was running."""
+    """Answer to a cancellation."""
 
     cancelled: bool = False
 
@@ -228,7 +228,7 @@ class ErrorData(Open):
 
     kind: str = ""
     remedy: str = ""
-    """What to do next; empty where the message says it."""
+    """Next step; empty where the message says it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

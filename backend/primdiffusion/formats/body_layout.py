@@ -1,4 +1,4 @@
-"""Where the primitives are attached to the default body, from layout.npz: the inputs of `Anchors` as numpy arrays."""
+"""Places of the primitives on the default body, from layout.npz: the inputs of `Anchors` as numpy arrays."""
 
 from __future__ import annotations
 

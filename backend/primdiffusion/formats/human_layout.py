@@ -1,5 +1,5 @@
-"""What both programs share of .human files: the metadata, which state the format's version and how the human was made;
-and the compact form, with colours and densities in eight bits."""
+"""The part of .human files that both programs share: the metadata, which state the format's version and the human's
+origin, and the compact form, with colours and densities in eight bits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Edit(Open):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Provenance(Open):
-    """How a human was made; a file need not state all of it, and may state more."""
+    """Origin of a human; a file need not state all of it, and may state more."""
 
     seed: int = 0
     steps: int = 0

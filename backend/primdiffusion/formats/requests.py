@@ -37,7 +37,7 @@ Reconstruction = Literal["encoder", "prior"]
 PASSES = ("img", "mask", "depth", "normal", "part")
 """Images of a captured view."""
 FLOAT_DEPTH = "depth_float"
-"""One more, written only if asked for."""
+"""Further image, written only if asked for."""
 RAY_STEP = 0.004
 """Metres between samples of a ray."""
 DENSITY_GAIN = 1.6
@@ -90,8 +90,8 @@ class Conditioning:
     """Attributes, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7. `info` lists the names and values that a
     checkpoint knows."""
     guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 2.0
-    """How strongly attributes are followed, in a new human also those that the seed chooses: 1 as in the training data;
-    more exaggerates and costs variety."""
+    """Strength of attributes (classifier-free guidance), also of those that the seed chooses: 1 follows the training
+    data; more exaggerates and costs variety."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -236,7 +236,7 @@ class TransferRequest(RegionRequest):
     what: Transfer = "texture"
     """texture: colours only, for garments of the same cut; garment: shape too."""
     harmonise: Fraction = 0.0
-    """How much the region is denoised again to match the rest of the human: 0 copies it exactly."""
+    """Strength of harmonising: the region is noised and denoised again to match the rest; 0 copies it exactly."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -270,7 +270,7 @@ def _alternatives(union: Any) -> list[Any]:
 
 
 def _expected(kind: Any) -> str:
-    """What to give for a field, in an error: "an integer from 1 to 1000"."""
+    """Description of a field's values, for an error: "an integer from 1 to 1000"."""
     plain, marks = split(kind)
     origin = typing.get_origin(plain) or plain
     if origin in (types.UnionType, typing.Union):

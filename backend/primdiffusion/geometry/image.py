@@ -15,7 +15,7 @@ from torch import Tensor
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Image:
-    """What a camera sees, on black: linear RGB, opacity and depth, and, where they are drawn, normals and parts."""
+    """Image of a camera, on black: linear RGB, opacity and depth, and, where they are drawn, normals and parts."""
 
     rgb: Float32[ndarray, "h w 3"]
     """Linear, premultiplied by `alpha`."""

@@ -32,7 +32,7 @@ class TexturedPart:
     skin_index: Int[np.ndarray, "V M"]
     """Joints (of 24) that influence each vertex; M is 4 for MakeHuman samples."""
     skin_weight: Float[np.ndarray, "V M"]
-    """Their weights; each row sums to one."""
+    """Weights of the joints; each row sums to one."""
 
     def __post_init__(self) -> None:
         """Check that the shapes of the arrays agree.

@@ -203,7 +203,7 @@ def coloured_strands(hair: Strands, colour: Float[np.ndarray, "3"]) -> UInt8[np.
     return np.concatenate([rgb, hair.alpha[..., None]], axis=-1)
 
 
-def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
+def tint_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
     """Colour brows or lashes with one linear colour; alpha is increased so that they pass the alpha test."""
     texture = np.empty_like(picture)
     texture[..., :3] = bytes_from_linear(colour.astype(np.float64))

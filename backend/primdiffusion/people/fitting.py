@@ -82,7 +82,7 @@ def skirt_faces(garment: Garment, mesh: ObjMesh) -> Bool[np.ndarray, " F"]:
     return np.isin(connected_faces(mesh.faces, len(mesh.vertices)), pieces)
 
 
-def lengthened(
+def lengthen(
     vertices: Float[np.ndarray, "V 3"], skirt: Int[np.ndarray, "F 3"], factor: float
 ) -> Float[np.ndarray, "V 3"]:
     """Stretch a skirt downwards from its waist."""

@@ -18,7 +18,7 @@ from primdiffusion.people.fitting import (
     cover,
     fit_item,
     item_skinning,
-    lengthened,
+    lengthen,
     shown_faces,
     sink_below_cloth,
     skin_under_hem,
@@ -105,7 +105,7 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
     fitted = {name: fit_item(assets, base, path, vertices) for name, path in worn.items()}
     skirt = skirt_faces(choice.outfit, pairs["outfit"][1])
     if choice.outfit.lengthened != 1:
-        fitted["outfit"] = lengthened(fitted["outfit"], pairs["outfit"][1].faces[skirt], choice.outfit.lengthened)
+        fitted["outfit"] = lengthen(fitted["outfit"], pairs["outfit"][1].faces[skirt], choice.outfit.lengthened)
     shoes = pairs["shoes"][1].faces
     sock_pieces = [number for number, piece in enumerate(choice.shoes.pieces) if piece.kind == "sock"]
     sock = np.isin(connected_faces(shoes, len(pairs["shoes"][1].vertices)), sock_pieces)
@@ -147,8 +147,8 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
     textures: dict[str, UInt8[np.ndarray, "H W 4"]] = {
         "body": skin_picture,
         "eyes": appearance.eye_texture(assets, iris),
-        "eyebrows": appearance.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
-        "eyelashes": appearance.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
+        "eyebrows": appearance.tint_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
+        "eyelashes": appearance.tint_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
         "outfit": garments.coloured(garments.cloth(assets, base, choice.outfit), outfit),
         "shoes": garments.coloured(garments.cloth(assets, base, choice.shoes), shoes),
     }

@@ -70,9 +70,7 @@ def attach(anchors: Anchors, vertices: Float[Tensor, "*b v 3"], faces: Int[Tenso
     return Frames(position, torch.stack([tangent, bitangent, normal], -1), half_extent)
 
 
-def stretched(
-    frames: Frames, anchors: Anchors, posed: Float[Tensor, "*b v 3"], rest: Float[Tensor, "*b v 3"]
-) -> Frames:
+def stretch(frames: Frames, anchors: Anchors, posed: Float[Tensor, "*b v 3"], rest: Float[Tensor, "*b v 3"]) -> Frames:
     """Frames whose boxes grow in their plane where the posed skin is stretched compared with `rest`.
 
     The paper computes sizes once; then boxes come apart where a pose stretches the skin, at the groin of a raised leg.

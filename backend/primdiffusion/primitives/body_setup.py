@@ -44,7 +44,7 @@ class BodyFiles:
 
     smpl: FileFingerprint
     uv: tuple[FileFingerprint, ...]
-    """One .obj or .npz, or the pair vt.npy and ft.npy."""
+    """Files of texture coordinates: one .obj or .npz, or the pair vt.npy and ft.npy."""
 
     def to_json(self) -> str:
         """Serialise to JSON for file metadata."""

@@ -39,7 +39,7 @@ def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: 
 def rasterise_colourings(
     meshes: Sequence[TexturedMesh], views: Sequence[Camera | OrthographicView], supersample: int = 1
 ) -> Iterator[list[Image]]:
-    """As `rasterise`, for each view: the images of meshes that differ only in the colours of their textures.
+    """Same as `rasterise`, for each view: the images of meshes that differ only in the colours of their textures.
 
     Triangles are drawn once for a view, and textures gathered once.
 
@@ -72,7 +72,7 @@ class Figure:
     """A mesh prepared for rendering in many poses: what does not depend on the pose, all parts concatenated."""
 
     mesh: TexturedMesh
-    """In the rest pose."""
+    """Mesh in the rest pose."""
     soup: TriangleSoup
     """Its triangles in the rest pose."""
     joint: UInt8[np.ndarray, "F"]

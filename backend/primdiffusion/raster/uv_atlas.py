@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from primdiffusion.raster.z_buffer import barycentrics, z_buffer
 
 EDGE_SLACK = 1e-9
-"""In barycentric coordinates: a gap between two faces would be worse than a texel of both."""
+"""Slack in barycentric coordinates: a gap between two faces would be worse than a texel of both."""
 
 
 @dataclasses.dataclass(frozen=True)

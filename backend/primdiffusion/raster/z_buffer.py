@@ -175,7 +175,7 @@ def _locate(points, faces, parallel, triangle, found):
 
 @numba.njit(cache=True, nogil=True)
 def _project_corners(corners, linear, shift, near, points):
-    """As `project`, in one pass over millions of corners in the world."""
+    """Same as `project`, in one pass over millions of corners in the world."""
     for f in range(len(corners)):
         for corner in range(3):
             x, y, z = corners[f, corner, 0], corners[f, corner, 1], corners[f, corner, 2]

@@ -18,7 +18,7 @@ from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames, frames_of
-from primdiffusion.human import Human, default_frames, made_by
+from primdiffusion.human import Human, default_frames, model_provenance
 from primdiffusion.primitives.primitives import Frames, Payload
 from primdiffusion.reconstruction.posture_fit import each
 from primdiffusion.reconstruction.prior_fit import FIT_STEPS, PriorFit
@@ -82,7 +82,7 @@ def draw_humans(
         payload = _descended(payload, views, frames, PULLED_DESCENT, components.full_density)
         on_step()
         drawn = {} if seed is None else {"seed": seed}
-        yield Human(payload, person.betas, {**_origin(person), **drawn, **made_by(model)}).validate()
+        yield Human(payload, person.betas, {**_origin(person), **drawn, **model_provenance(model)}).validate()
 
 
 def _origin(person: CapturedPerson) -> dict[str, Any]:

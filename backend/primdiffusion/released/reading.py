@@ -24,7 +24,7 @@ class TensorEntry:
     """One tensor."""
 
     key: str
-    """Its name in the file."""
+    """Name in the file."""
     group: str
     """"schedule", "diffusion", or a module of the body decoder."""
     shape: tuple[int, ...]

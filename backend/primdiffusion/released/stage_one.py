@@ -60,7 +60,7 @@ class DecoderLayer:
     """A convolution of the encoder "released"."""
 
     name: str
-    """Its module in `Encoder`."""
+    """Module in `Encoder`."""
     weight: tuple[int, ...]
     bias: tuple[int, ...]
 

@@ -29,7 +29,7 @@ from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import MarchSettings, Rendering, march
 from primdiffusion.runtime.failures import PictureOutOfMemory, out_of_memory
 
-BETAS = (0.7, 0.9)
+ADAM_BETAS = (0.7, 0.9)
 """Adam's decay rates; short averages, because a run is some tens or hundreds of steps."""
 WARM_UP = 3
 """Warm-up of the rates, in steps: Adam's first steps have the same length for any gradient."""
@@ -88,7 +88,7 @@ def descend(
     leaves = _Leaves.of(start)
     first = [leaf.detach().clone() for leaf in leaves]
     groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
-    adams = [(Adam.of([leaf], BETAS), rate) for leaf, rate in groups]
+    adams = [(Adam.of([leaf], ADAM_BETAS), rate) for leaf, rate in groups]
     chosen = _chosen(views, settings)
     covered = sum(float(view.rgba[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
 

@@ -17,7 +17,7 @@ from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
 
 Compositing = Literal["mixed", "index_order"]
-"""How overlapping boxes are composited at a lattice point (SPEC 4): mixed by opacity, or by index, lowest first."""
+"""Compositing of overlapping boxes at a lattice point (SPEC 4): mixed by opacity, or by index, lowest first."""
 
 ORTHOGONAL = 1e-2
 """Largest entry of |R^T R - 1| accepted as rounding of a rotation."""
@@ -42,7 +42,7 @@ class MarchSettings(Checked):
     step: Positive = RAY_STEP
     """Distance between the samples of the largest boxes, metres: the largest stride times the spacing."""
     strides: Annotated[tuple[Annotated[int, Range(1, LARGEST_STRIDE)], ...], Length(1)] = (4, 2, 1)
-    """In descending order; each divides the previous one."""
+    """Strides in descending order; each divides the previous one."""
     samples_per_voxel: Positive = 2.0
     """Smallest number of samples along the shortest edge of a voxel."""
     compositing: Compositing = "mixed"

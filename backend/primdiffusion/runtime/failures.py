@@ -22,7 +22,7 @@ class ErrorDescription:
     kind: str
     sentence: str
     remedy: str
-    """What to do next; empty if the sentence says so already."""
+    """Next step; empty if the sentence says so already."""
 
     def __str__(self) -> str:
         return f"{self.sentence}: {self.remedy}" if self.remedy else self.sentence
@@ -76,7 +76,7 @@ def traceback_of(error: BaseException) -> str:
 
 
 def _described(error: BaseException) -> ErrorDescription | None:
-    sentence = shortened(" ".join(str(error).split())) or type(error).__name__
+    sentence = shorten(" ".join(str(error).split())) or type(error).__name__
     if isinstance(error, PictureOutOfMemory):
         return ErrorDescription("out_of_memory", sentence, PICTURE_REMEDY)
     if out_of_memory(error):
@@ -102,7 +102,7 @@ def _described(error: BaseException) -> ErrorDescription | None:
     return None
 
 
-def shortened(sentence: str) -> str:
+def shorten(sentence: str) -> str:
     """Return a sentence whose quoted texts and lists, which may be of a hostile file, are cut to a readable length."""
 
     def cut(value: re.Match[str]) -> str:

@@ -164,7 +164,7 @@ class CellTask(DiffusionTask):
         return x0_errors({"rms": self.denoiser}, self.denoiser.schedule, self.held.latents)["rms"]
 
     def errors_beside_closed_forms(self) -> dict[str, dict[int, float]]:
-        """As `errors`, also for the prior as a single Gaussian and as a mixture, on the same noise."""
+        """Same as `errors`, also for the prior as a single Gaussian and as a mixture, on the same noise."""
         guesses = {
             "gaussian": closed_form(self.denoiser, single=True),
             "mixture": closed_form(self.denoiser, single=False),

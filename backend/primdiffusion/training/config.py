@@ -57,7 +57,7 @@ class PriorConfig:
     """Principal axes of a covariance."""
     shared: int = 4
     """Directions of the skin, which clothes and heads share."""
-    lean: float = 10.0
+    shrinkage: float = 10.0
     """Shrinkage of the details in the groups' covariances to those of all data: its weight as samples."""
     folds: int = 4
     """Folds of the cross-validation that measures how much variance of each component generalises to new people."""
@@ -93,7 +93,7 @@ class NetworkTraining(OptimiserSettings):
     levels: Levels = "uniform"
     """Distribution of noise levels: uniform in t, as in the paper; log_normal in noise over signal, near the spread of
     what is denoised (Karras et al. 2022), with a fifth of all levels evenly in its logarithm."""
-    blend: Fraction = 0.3
+    blend_fraction: Fraction = 0.3
     """Fraction of samples that blend the colour variants of one geometry. Default preset only."""
     unasked: Fraction = 0.5
     """Fraction of samples trained without attributes; the others have a random subset. Default preset only."""
@@ -146,9 +146,10 @@ class TrainingConfig(RunSettings):
     model: LocalUNetConfig = dataclasses.field(default_factory=LocalUNetConfig)
     local: NetworkTraining = dataclasses.field(
         default_factory=lambda: NetworkTraining(
-            steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True, optimiser="muon"
+            steps=38_000, batch=16, blend_fraction=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True,
+            optimiser="muon",
         )
-    )
+    )  # fmt: skip
     """Training of the default preset's network."""
     unet: UNetConfig = PAPER
     """Size of the paper preset's network."""

@@ -1,4 +1,4 @@
-"""What training of either preset of the diffusion model has in common: optimiser, held-out errors, pictures; and
+"""The part of training that both presets of the diffusion model share: optimiser, held-out errors, pictures; and
 the preset `paper`: the paper's U-Net on whole slabs (paper sec. 3.3, SPEC 3).
 """
 
@@ -19,7 +19,6 @@ from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.files.picture_files import write_png
-from primdiffusion.formats import requests
 from primdiffusion.geometry.image import encode_srgb, to_bytes
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.people.stored_people import PersonFolder, payload_of_bytes
@@ -79,12 +78,10 @@ class DiffusionTask(Task):
 
 
 @torch.no_grad()
-def write_samples(
-    path: Path, model: DiffusionModel, seeds: Sequence[int] = SEEDS, steps: int = requests.Sampling.steps
-) -> None:
-    """Write an image of humans of `seeds`, side by side over black. Raises OSError."""
+def write_samples(path: Path, model: DiffusionModel) -> None:
+    """Write an image of the humans of SEEDS, side by side over black. Raises OSError."""
     pictures = []
-    for human in generate_batch(model, seeds, steps):
+    for human in generate_batch(model, SEEDS):
         primitives = place(human)
         camera = framing(primitives, YAW_DEGREES, WIDTH, HEIGHT).to(model.device)
         rendering = march(primitives.to(model.device), camera, MarchSettings(step=STEP))

@@ -7,6 +7,7 @@ import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
@@ -210,16 +211,16 @@ def _features(config: FitConfig, device: torch.device) -> Features | None:
     return load_perceptual(path).to(device) if config.loss.perceptual and path is not None else None
 
 
-def measure(model: EncoderModel, captures: Captures, people: int = PEOPLE) -> float:
+def measure(model: EncoderModel, captures: Captures) -> float:
     """Mean PSNR (dB, images of SIZE x SIZE pixels) of two views of each of a few subjects, in another pose."""
-    found = [psnr(image, target) for image, target, _ in _compared(model, captures, people, "whole")]
+    found = [psnr(image, target) for image, target, _ in _compared(model, captures, "whole")]
     return float(torch.cat(found).mean())
 
 
-def write_pictures(path: Path, model: EncoderModel, captures: Captures, people: int = PEOPLE) -> None:
+def write_pictures(path: Path, model: EncoderModel, captures: Captures) -> None:
     """Write a row for each subject: an input image, then twice a rendered one beside its capture, in another pose."""
     rows = []
-    for image, target, given in _compared(model, captures, people, "crop"):
+    for image, target, given in _compared(model, captures, "crop"):
         pairs = [side for pair in zip(image, target, strict=True) for side in pair]
         rows.append(torch.cat([given, *pairs], dim=1))
     write_png(path, to_bytes(torch.cat(rows)).numpy())
@@ -227,13 +228,13 @@ def write_pictures(path: Path, model: EncoderModel, captures: Captures, people: 
 
 @torch.no_grad()
 def _compared(
-    model: EncoderModel, captures: Captures, people: int, framing: str
+    model: EncoderModel, captures: Captures, framing: Literal["whole", "crop"]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Yield for each subject two rendered images, the captured ones and an input, sRGB-encoded on the CPU."""
-    settings = SampleSettings(8, 2, SIZE, "crop" if framing == "crop" else "whole", "first")
+    settings = SampleSettings(8, 2, SIZE, framing, "first")
     dataset = CaptureDataset(captures, settings, SEED)
     device = model.encoder.scale_out.bias.device
-    for index in range(min(people, len(dataset))):
+    for index in range(min(PEOPLE, len(dataset))):
         sample = dataset[0, index]
         betas = default_betas(captures.subject(captures.subjects[int(sample.subject)]))
         payload = model.encode(sample.conditioning, betas)

@@ -21,7 +21,7 @@ from primdiffusion.capture.reader import Captures, Views
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import frames_of, unproject_views
 from primdiffusion.encoder.network import motion_of
-from primdiffusion.encoder.texture import eroded
+from primdiffusion.encoder.texture import erode
 from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Frames
@@ -71,7 +71,7 @@ class FitDataset(SampleSet[FitSample]):
             found=unproject_views(self.encoder, given, betas),
             axis_angle=motion_of(given.pose.joint_rotation),
             frames=frames_of(self.encoder, betas, target.pose)[1],
-            target=eroded(target) if self.encoder.masks == "eroded" else target,
+            target=erode(target) if self.encoder.masks == "eroded" else target,
             subject=sample.subject,
             frame=sample.frame,
         )

@@ -75,7 +75,7 @@ def loss_terms(
 
 
 class PerceptualLoss(nn.Module):
-    """How far two pictures lie apart in the features of VGG19 (SPEC 2; Johnson et al. 2016). Nothing in it learns.
+    """Distance of two pictures in the features of VGG19 (SPEC 2; Johnson et al. 2016). Nothing in it learns.
 
         loss = sum over layers of w_l * mean |F_l(image) - F_l(target)|
 

@@ -69,9 +69,9 @@ class RestObjective:
         """Draw noisy people; return their rest, guessed coefficients, step, condition and clean rest."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
         t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
-        weights, indices = blends(self.people, len(t), self.config.blend, generator)
+        weights, indices = blends(self.people, len(t), self.config.blend_fraction, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
-        z = mixed(self.people.latents, weights, indices)
+        z = mix(self.people.latents, weights, indices)
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
         z[flip] = self.codec.mirror(z[flip])
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
@@ -126,7 +126,7 @@ def blends(
     return torch.stack([1 - part, part], dim=1), torch.stack([first, second], dim=1)
 
 
-def mixed(
+def mix(
     samples: Float[Tensor, "n *s"], weights: Float[Tensor, "b 2"], indices: Int[Tensor, "b 2"]
 ) -> Float[Tensor, "b *s"]:
     """Weighted sums of pairs of samples, in float32; samples of weight 0 are not read."""

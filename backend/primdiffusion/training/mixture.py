@@ -52,7 +52,7 @@ class Kind(NamedTuple):
     """A group, a head and features that go together."""
 
     share: float
-    """Its share of people."""
+    """Share of people in the group."""
     choices: tuple[int, ...]
     """The number of its choice of each key."""
 
@@ -76,8 +76,8 @@ def fit_mixture(
     skin, skin_of_head, remainder = _skin(remainder, clothes, groups, inside, config)
     bare = _bare(heads, vocabulary, config)[heads.of_person]
     of_bare = groups._replace(of_person=groups.of_person[bare])
-    axes = _axes(_covariances(remainder[bare, :clothes], of_bare, config.outfit, config.lean), config.axes)
-    head_axes = _axes(_covariances(remainder[:, clothes:], heads, config.hair, config.lean), config.axes)
+    axes = _axes(_covariances(remainder[bare, :clothes], of_bare, config.outfit, config.shrinkage), config.axes)
+    head_axes = _axes(_covariances(remainder[:, clothes:], heads, config.hair, config.shrinkage), config.axes)
     return {
         "axes": axes[0], "variance": axes[1], "left": axes[2],
         "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
@@ -105,7 +105,7 @@ def _keys(condition: Float[Tensor, "n x"], vocabulary: AttributeVocabulary, conf
 def _effects(
     c: Float[Tensor, "n r"], clothes: int, keys: Sequence[Key]
 ) -> tuple[list[Float[Tensor, "v r"]], Float[Tensor, "n r"]]:
-    """What every choice of every key adds to the mean, and what they leave, by backfitting.
+    """Effects of every choice of every key on the mean, and the remainder, by backfitting.
 
     Groups say what clothes are like, and heads what hands and head are like. The other keys add what they show to:
     long hair hangs over a collar, but the shirts of the few people who have it do not colour everybody's.
@@ -129,7 +129,7 @@ def _ridge(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"]) -> Float[Tenso
 
 
 def _shown(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"], freedoms: int) -> Float[Tensor, "v r"]:
-    """As `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
+    """Same as `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
 
     F compares what the design's degrees of freedom explain with what they would explain by chance.
     """
@@ -172,13 +172,13 @@ def _bare(heads: Key, vocabulary: AttributeVocabulary, config: PriorConfig) -> B
     return bare | ~bare.any()
 
 
-def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> list[Float[Tensor, "i i"]]:
+def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, shrinkage: float) -> list[Float[Tensor, "i i"]]:
     """Covariance of each choice's people: that of their colours and that of details.
 
     Colours are the leading principal directions of all people who have the same of `worn`, whatever their sex; few
     patterned people have those of many plain ones, but do not lend them their prints. Of details, which are what
-    colours leave, `lean` people are those of all choices alike in the last attribute: their colours would be sleeves
-    that differ from the shirt.
+    colours leave, `shrinkage` people are those of all choices alike in the last attribute: their colours would be
+    sleeves that differ from the shirt.
     """
     if not len(c):
         return [torch.zeros(c.shape[1], c.shape[1]) for _ in key.choices]
@@ -195,7 +195,7 @@ def _covariances(c: Float[Tensor, "n i"], key: Key, worn: str, lean: float) -> l
     scatter = torch.stack([(detail * own[:, None]).T @ detail for own in members])
     covariances = []
     for g, colour in enumerate(colours):
-        share = SAME_GARMENTS * same[g] * alike[g] + lean * alike[g] / (alike[g] @ counts).clamp_min(1)
+        share = SAME_GARMENTS * same[g] * alike[g] + shrinkage * alike[g] / (alike[g] @ counts).clamp_min(1)
         share[g] += 1 - SAME_GARMENTS
         covariances.append(colour + torch.einsum("h,hij->ij", share / (share @ counts).clamp_min(1e-6), scatter))
     return covariances

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from primdiffusion.render.cuda.graph import Recorded
 
-BETAS = (0.9, 0.99)
+ADAM_BETAS = (0.9, 0.99)
 """Decay of AdamW's two moments."""
 ENDS = ("inner", "outer", "asked")
 """Layers that meet data rather than features, by name in the network of the default preset; left to AdamW."""
@@ -39,7 +39,7 @@ class MuonAdamW(torch.optim.Optimizer):
             lr=1.0, weight_decay=0.0, adjust_lr_fn="match_rms_adamw",
         )  # fmt: skip
         self._recorded, self._weight_decay = Recorded(self._changes), weight_decay
-        self._adamw = torch.optim.AdamW(others, lr=learning_rate, weight_decay=weight_decay, betas=BETAS)
+        self._adamw = torch.optim.AdamW(others, lr=learning_rate, weight_decay=weight_decay, betas=ADAM_BETAS)
         super().__init__([{"params": own, "factor": FACTOR}, {"params": others, "factor": 1.0}], {"lr": learning_rate})
 
     @torch.no_grad()

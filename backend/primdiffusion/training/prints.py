@@ -37,7 +37,7 @@ class Print(NamedTuple):
     box: Int[Tensor, "m"]
     """Places among the garment's boxes."""
     second: Float[Tensor, "m 512"]
-    """How much of a voxel's colour is the second one."""
+    """Share of a voxel's colour that is the second one."""
 
 
 def find_prints(

@@ -159,14 +159,18 @@ def _smooth(values: Float[Tensor, "r"], width: int = 9) -> Float[Tensor, "r"]:
     return functional.avg_pool1d(padded, width, stride=1)[0, 0].exp()
 
 
-def fit_shapes(people: LatentSet, prior: PersonPrior, ridge: float = 30.0) -> ShapePrior:
+SHAPE_RIDGE = 30.0
+"""Weight of the penalty on the regression of body shapes: people are fewer than coefficients."""
+
+
+def fit_shapes(people: LatentSet, prior: PersonPrior) -> ShapePrior:
     """Body shapes by ridge regression on the person coefficients in standard deviations."""
     first = torch.searchsorted(people.geometry, torch.arange(len(people.betas)))
     x = torch.cat([prior.split(chunk.float())[0] for chunk in people.latents[first].split(CHUNK)])
     x = x / prior.marginal_variance().sqrt()
     bias = people.betas.mean(0)
     target = people.betas - bias
-    gram = x @ x.T + ridge * torch.eye(len(x))  # people are fewer than coefficients
+    gram = x @ x.T + SHAPE_RIDGE * torch.eye(len(x))
     dual = torch.linalg.solve(gram, target)
     left = dual / torch.linalg.inv(gram).diagonal()[:, None]  # of each person, by the regression on the others
     covariance = left.T @ left / len(left) + 1e-4 * torch.eye(left.shape[1])

@@ -18,7 +18,7 @@ from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.runtime.device import best_device
 from primdiffusion.training.config import OptimiserSettings
-from primdiffusion.training.muon import BETAS, MuonAdamW
+from primdiffusion.training.muon import ADAM_BETAS, MuonAdamW
 
 PATIENCE = datetime.timedelta(hours=3)
 """Longest wait for the main process, which alone evaluates, renders and prepares data."""
@@ -121,7 +121,7 @@ def adamw(
 ) -> torch.optim.AdamW:
     """AdamW of a network's parameters; `others` are further ones, each with a factor on their learning rate."""
     groups = [{"params": list(group), "factor": factor} for group, factor in ((parameters, 1.0), *others)]
-    return torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=BETAS)
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=ADAM_BETAS)
 
 
 def saved_step(path: Path) -> int:

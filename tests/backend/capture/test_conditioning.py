@@ -62,11 +62,6 @@ def test_all_cameras_are_taken_where_there_are_no_more(tmp_path):
     assert spread_cameras(ring(tmp_path, 5), 0, 8) == (0, 1, 2, 3, 4)
 
 
-def test_less_than_one_view_is_rejected(tmp_path):
-    with refused(ValueError, "0 views"):
-        spread_cameras(ring(tmp_path, 5), 0, 0)
-
-
 def test_views_are_the_pictures_and_masks_of_the_cameras(dataset):
     captures = open_captures(dataset)
     views = conditioning_views(captures, FIRST, 1, (3, 1))
@@ -102,10 +97,10 @@ def test_without_a_known_subject_the_nearest_are_named_first(dataset):
         choose_subject(dataset, "person_00001")
 
 
-@pytest.mark.parametrize("frame", [-1, 2])
-def test_a_frame_that_was_not_captured_is_rejected(dataset, frame):
-    with refused(ValueError, str(frame)):
-        captured_person(dataset, FIRST, frame)
+@pytest.mark.parametrize(("frame", "views", "why"), [(-1, 8, "-1"), (2, 8, "2"), (0, 0, "0 views")])
+def test_frames_that_were_not_captured_and_no_views_are_rejected(dataset, frame, views, why):
+    with refused(ValueError, why):
+        captured_person(dataset, FIRST, frame, views)
 
 
 def rewrite_betas(folder, betas) -> None:

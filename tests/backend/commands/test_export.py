@@ -15,7 +15,7 @@ from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.commands.export import gaussians, merge, proxy
 from primdiffusion.commands.session import Session
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.requests import GaussiansRequest, MergeRequest, PosedPerson, ProxyRequest
 from primdiffusion.human import generate, place, pose_body
@@ -59,17 +59,17 @@ def test_a_posed_person_becomes_gaussians(saved):
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--out", "anna.stl"], "^out is 'anna.stl': give"),
-        (["--out", "anna.glb", "--pose", "pose.json"], "^pose cannot be stored"),
-        (["--out", "anna.ply", "--frame", "2"], "^frame is 2"),
+        (["--out", "anna.stl"], "out is 'anna.stl': give"),
+        (["--out", "anna.glb", "--pose", "pose.json"], "pose cannot be stored"),
+        (["--out", "anna.ply", "--frame", "2"], "frame is 2"),
         (["--out", "nowhere/anna.glb"], "there is no folder"),
-        (["--out", "anna.npz", "--voxel", "0"], "^voxel is 0"),
-        (["--out", "anna.npz", "--voxel", "0.0001"], "choose .* mm or more"),
+        (["--out", "anna.npz", "--voxel", "0"], "voxel is 0"),
+        (["--out", "anna.npz", "--voxel", "0.0001"], "mm or more"),
     ],
 )
 def test_what_cannot_be_exported_is_rejected_before_any_work(saved, monkeypatch, more, sentence):
     monkeypatch.chdir(saved.parent)
-    with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+    with refused((ValueError, FileNotFoundError), sentence):
         cli.run(["export", str(saved), *more])
     assert list(saved.parent.iterdir()) == [saved]
 
@@ -163,7 +163,7 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, pos
         got = grid["density"].sum(dtype=np.float64)
     grown, ungrown = (
         upright_grid(place(one, pose(2)), VOXEL).density.sum(dtype=np.float64)
-        for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
+        for one in (reshape_human(human, betas), dataclasses.replace(human, betas=betas))
     )
     assert abs(grown / ungrown - 1) > 0.02
     assert got == pytest.approx(grown, rel=1e-3)

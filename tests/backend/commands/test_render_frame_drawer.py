@@ -11,7 +11,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.commands import render as frame_drawer
 from primdiffusion.commands.render import FrameDrawer, map_frame
 from primdiffusion.drawing import Scene, ViewSettings, draw
-from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
@@ -80,7 +80,7 @@ def test_other_betas_draw_the_reshaped_person_whose_boxes_have_grown(human, pose
     camera = framing(place(human, pose), 23, WIDTH, HEIGHT)
     grown, ungrown = (
         draw(Scene(place(one, pose)), camera, ViewSettings(clip=(0.0, 1e10))).rgba
-        for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
+        for one in (reshape_human(human, betas), dataclasses.replace(human, betas=betas))
     )
     assert np.abs(grown - ungrown).max() > 0.1
     assert np.allclose(got, grown, atol=2e-3)

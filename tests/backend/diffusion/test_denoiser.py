@@ -129,15 +129,15 @@ def test_what_is_left_open_is_completed_and_what_is_asked_for_stays():
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"hair": "mohawk"}, "mohawk.*bald, bob, long"),
-        ({"beard": "full"}, "beard.*sex, hair, height"),
-        ({"height": 2.5}, r"height is 2.5.*1.3 to 2.1"),
-        ({"height": "tall"}, "height is 'tall'"),
-        ({"height": float("nan")}, "height"),
+        ({"hair": "mohawk"}, ("mohawk", "bald, bob, long")),
+        ({"beard": "full"}, ("beard", "sex, hair, height")),
+        ({"height": 2.5}, ("height is 2.5", "1.3 to 2.1")),
+        ({"height": "tall"}, ("height is 'tall'",)),
+        ({"height": float("nan")}, ("height",)),
     ],
 )
 def test_what_a_model_does_not_know_is_rejected_with_what_it_knows(asked, words):
-    with pytest.raises(ValueError, match=words):
+    with refused(ValueError, *words):
         WORDS.encode(asked)
     with refused(ValueError, "nothing"):
         NOTHING.encode(asked)

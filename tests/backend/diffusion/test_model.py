@@ -6,7 +6,7 @@ import torch
 from diffusion_people import small_model
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import WholeSlab
-from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded
+from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded_generator
 from primdiffusion.diffusion.schedule import trailing_steps
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.files.tensor_file import read, save
@@ -38,7 +38,7 @@ def test_a_start_without_the_prior_loses_variety():
     # a few strong components still show at T-1: noise alone stands for a person without them
     model = small_model(scale=300.0)
     last = 999
-    start = model.start([seeded(seed) for seed in range(400)], last)
+    start = model.start([seeded_generator(seed) for seed in range(400)], last)
     prior = model.denoiser.prior
     y = prior.split(start, torch.tensor(model.schedule.signal(last)))[0]
     expected = model.schedule.signal(last) ** 2 * prior.marginal_variance() + model.schedule.noise(last) ** 2
@@ -68,7 +68,7 @@ def test_shapes_follow_the_person_and_the_seed_within_limits(model):
 
 
 def test_shapes_without_knowledge_are_standard_normal():
-    betas = STANDARD_SHAPES.sample(torch.zeros(20_000, 0), seeded(0))
+    betas = STANDARD_SHAPES.sample(torch.zeros(20_000, 0), seeded_generator(0))
     assert betas.mean(0).abs().max() < 0.05
     assert (betas.std(0) - 1).abs().max() < 0.05
 
@@ -116,19 +116,19 @@ def test_guidance_extrapolates_person_components_and_the_rest_follows_from_them(
 
 def test_categories_that_nobody_asked_for_are_drawn_and_those_asked_for_stay(model):
     suit = model.condition({"outfit": "suit"})
-    generators = [seeded(seed) for seed in range(40)]
+    generators = [seeded_generator(seed) for seed in range(40)]
     anything = model.complete(generators, None)
     assert anything.shape == (40, model.vocabulary.width)
     assert (anything.sum(1) == 1).all()
     assert 0 < anything[:, 0].mean() < 1
     assert torch.equal(model.complete(generators, suit[None]), suit.expand(40, -1))
-    again = [model.complete([seeded(seed)])[0] for seed in range(40)]
+    again = [model.complete([seeded_generator(seed)])[0] for seed in range(40)]
     assert torch.equal(torch.stack(again), anything)
 
 
 def test_asking_draws_the_start_from_those_who_have_it(model):
     condition = model.condition({"outfit": "suit"})
-    starts = model.start([seeded(seed) for seed in range(300)], 0, condition)
+    starts = model.start([seeded_generator(seed) for seed in range(300)], 0, condition)
     c = model.denoiser.prior.split(starts)[0]
     assert torch.allclose(c.mean(0), model.denoiser.prior.centre[0, 1], atol=1.0)
     with refused(ValueError, "jeans"):

@@ -53,7 +53,7 @@ def start(count=4):
     return torch.randn(count, 3, dtype=F64, generator=torch.Generator().manual_seed(5))
 
 
-def seeded(*seeds):
+def seeded_generators(*seeds):
     return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
@@ -182,16 +182,16 @@ def test_a_sampler_that_is_not_asked_does_no_work(sampler):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_noise_of_a_sample_is_bit_identical_in_any_batch(dtype):
     like = torch.zeros(3, 2, 5, dtype=dtype)
-    together = gaussian_noise(like, seeded(1, 2, 3))
+    together = gaussian_noise(like, seeded_generators(1, 2, 3))
     assert together.dtype == dtype
-    assert torch.equal(together[1:2], gaussian_noise(like[:1], seeded(2)))
-    assert torch.equal(together[[2, 0]], gaussian_noise(like[:2], seeded(3, 1)))
+    assert torch.equal(together[1:2], gaussian_noise(like[:1], seeded_generators(2)))
+    assert torch.equal(together[[2, 0]], gaussian_noise(like[:2], seeded_generators(3, 1)))
     assert not torch.equal(together[0], together[1])
 
 
 def test_too_few_generators_are_rejected():
     with refused(ValueError, "3 samples"):
-        gaussian_noise(torch.zeros(3, 4), seeded(1, 2))
+        gaussian_noise(torch.zeros(3, 4), seeded_generators(1, 2))
 
 
 def test_dpmpp_2m_starts_where_there_is_no_signal():

@@ -7,11 +7,11 @@ import json
 import pytest
 import torch
 from diffusion_people import small_model
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.schedule import early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
 from primdiffusion.editing.inpaint import harmonise, inpaint
-from primdiffusion.editing.interpolate import interpolate, inversion_steps, inverted, slerp
+from primdiffusion.editing.interpolate import interpolate, inversion_steps, invert, slerp
 from primdiffusion.editing.regions import region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
@@ -80,7 +80,7 @@ def test_the_seed_that_made_a_person_does_not_lead_an_edit_back_to_them():
     person = generate(model, 5, steps=4)
     moved = [distance(vary(model, person, 1.0, seed, steps=4), person) for seed in (5, 6, 7)]
     assert moved[0] > 0.3 * max(moved)
-    noises = [torch.randn(4, generator=make(5)) for make in (seeded, edit_generator)]
+    noises = [torch.randn(4, generator=make(5)) for make in (seeded_generator, edit_generator)]
     assert not torch.isclose(*noises).any()
 
 
@@ -289,7 +289,7 @@ def test_ddim_backwards_and_forwards_returns_the_nearer_the_more_steps():
 
     def loss(steps):
         chain = inversion_steps(model.schedule, steps)
-        *_, up = inverted(model.denoise, model.schedule, x0, chain)
+        *_, up = invert(model.denoise, model.schedule, x0, chain)
         *_, down = ddim(model.denoise, model.schedule, up.x, chain, [])
         return float((down.x0 - x0).norm() / x0.norm())
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
-from primdiffusion.editing.inpaint import noised, paste_after_steps, renoised, repaint, start_like
+from primdiffusion.editing.inpaint import add_noise, paste_after_steps, renoise, repaint, start_like
 from support.tiny import tiny_model
 
 SCHEDULE = linear()
@@ -73,7 +73,7 @@ def test_as_released_the_outside_is_one_step_noisier_than_the_denoiser_is_told()
 
 def test_noise_added_on_the_way_up_makes_a_sample_of_the_upper_level():
     known = torch.full((1, 8, 64, 64), 2.0)
-    x = renoised(SCHEDULE, noised(SCHEDULE, known, 200, generator(1)), 200, 700, generator(2))
+    x = renoise(SCHEDULE, add_noise(SCHEDULE, known, 200, generator(1)), 200, 700, generator(2))
     assert float(x.mean()) == pytest.approx(2 * SCHEDULE.signal(700), abs=0.02)
     assert float(x.std()) == pytest.approx(SCHEDULE.noise(700), rel=0.01)
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.editing.reshaping import SHARE, box_growth, reshaped
+from primdiffusion.editing.reshaping import SHARE, box_growth, reshape_human
 from primdiffusion.human import Human, generate, place
 from primdiffusion.primitives.anchors import Anchors, cell_sides, default_anchors
 from support.errors import refused
@@ -32,9 +32,9 @@ def one(value: float) -> torch.Tensor:
 
 
 def test_with_the_betas_they_have_a_person_is_the_same_object(human):
-    assert reshaped(human, human.betas.clone()) is human
-    assert reshaped(human, human.betas + 5e-6) is human
-    assert reshaped(human, human.betas + 1e-4) is not human
+    assert reshape_human(human, human.betas.clone()) is human
+    assert reshape_human(human, human.betas + 5e-6) is human
+    assert reshape_human(human, human.betas + 1e-4) is not human
 
 
 def test_a_body_twice_as_large_has_boxes_larger_by_the_share_and_as_thick():
@@ -59,7 +59,7 @@ def test_sides_of_a_cell_are_by_hand_its_length_along_t_and_its_width_across():
 
 
 def test_boxes_grow_by_it_and_nothing_else_of_the_payload_changes(human):
-    wider = reshaped(human, WIDER)
+    wider = reshape_human(human, WIDER)
     growth = box_growth(default_body(), default_anchors(), human.betas, WIDER)
     assert torch.allclose(wider.betas, WIDER)
     assert torch.allclose(wider.payload.delta_scale, human.payload.delta_scale * growth)
@@ -72,14 +72,14 @@ def test_boxes_grow_by_it_and_nothing_else_of_the_payload_changes(human):
 
 def test_reshaping_twice_is_reshaping_once_and_back_again_is_nothing(human):
     other = torch.linspace(-1.5, 1.5, 10)
-    twice, once = reshaped(reshaped(human, WIDER), other), reshaped(human, other)
+    twice, once = reshape_human(reshape_human(human, WIDER), other), reshape_human(human, other)
     assert torch.allclose(twice.payload.delta_scale, once.payload.delta_scale, rtol=1e-5)
-    back = reshaped(reshaped(human, WIDER), human.betas)
+    back = reshape_human(reshape_human(human, WIDER), human.betas)
     assert torch.allclose(back.payload.delta_scale, human.payload.delta_scale, rtol=1e-5)
 
 
 def test_another_number_of_betas_and_nan_are_rejected(human):
     with refused(ValueError, "3 betas"):
-        reshaped(human, torch.zeros(3))
+        reshape_human(human, torch.zeros(3))
     with refused(ValueError, "finite"):
-        reshaped(human, torch.full((10,), torch.nan))
+        reshape_human(human, torch.full((10,), torch.nan))

@@ -11,7 +11,7 @@ from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import unproject_views
-from primdiffusion.encoder.texture import BESIDE, TEXTURE_SIDE, eroded, sample_both_sides, unproject_texture
+from primdiffusion.encoder.texture import BESIDE, TEXTURE_SIDE, erode, sample_both_sides, unproject_texture
 from primdiffusion.encoder.unproject import SIDE
 from primdiffusion.geometry.camera import Camera, look_at
 from scipy.ndimage import binary_erosion
@@ -138,7 +138,7 @@ def test_erosion_is_that_of_scipy_once_by_3_x_3():
     draws = np.random.default_rng(2)
     mask = np.where(draws.random((2, 20, 20)) < 0.9, draws.integers(1, 256, (2, 20, 20)), 0)
     views.rgba[..., 3] = torch.from_numpy(mask)
-    found = eroded(views).rgba.numpy()
+    found = erode(views).rgba.numpy()
     keep = np.stack([binary_erosion(one > 0, np.ones((3, 3)), border_value=1) for one in mask])
     assert 0.1 < keep.mean() < 0.9
     np.testing.assert_array_equal(found, views.rgba.numpy() * keep[..., None])
@@ -150,7 +150,7 @@ def test_masks_are_eroded_only_if_the_configuration_says_so():
     views.rgba[:, 8:24, 8:24, 3] = 255
     whole = dataclasses.replace(RELEASED, masks="whole")
     betas = torch.zeros(10)
-    expected = unproject_views(whole, eroded(views), betas)
+    expected = unproject_views(whole, erode(views), betas)
     found = unproject_views(RELEASED, views, betas)
     assert torch.equal(found.rgb, expected.rgb)
     assert not torch.equal(found.rgb, unproject_views(whole, views, betas).rgb)

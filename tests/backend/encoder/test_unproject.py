@@ -25,6 +25,7 @@ from primdiffusion.primitives.anchors import attach, default_anchors, default_te
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S
 from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.march import march
+from support.errors import refused
 
 BODY = default_body()
 ONES = torch.ones(K, 3)
@@ -316,14 +317,14 @@ def assert_rejected(
     unproject_views = (lambda: unproject_texels(views, vertices, 2, body)) if frames is None else (
         lambda: unproject_voxels(views, vertices, frames, ONES, 2)
     )  # fmt: skip
-    with pytest.raises(ValueError, match=message):
+    with refused(ValueError, message):
         unproject_views()
 
 
 def test_views_that_are_none_batched_or_no_bytes_are_rejected():
     views = person_views()
-    assert_rejected(r"uint8 \[v, H, W, 4\], v > 0", Views(views.rgba[:0], views.camera, views.pose))
-    assert_rejected(r"\(1, 4, 40, 40, 4\): give one human's", Views(views.rgba[None], views.camera, views.pose))
+    assert_rejected("uint8 [v, H, W, 4], v > 0", Views(views.rgba[:0], views.camera, views.pose))
+    assert_rejected("(1, 4, 40, 40, 4): give one human's", Views(views.rgba[None], views.camera, views.pose))
     assert_rejected("torch.float32", Views(views.rgba / 255, views.camera, views.pose))
 
 

@@ -8,7 +8,7 @@ from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,
     Inception,
     PictureFeatures,
-    average_pooled,
+    average_pool,
     load_clip_vision,
     load_inception,
 )
@@ -96,7 +96,7 @@ def test_features_are_one_row_a_picture_and_see_differences(inception, clip):
 
 
 def test_averages_at_the_edge_are_of_the_neighbours_that_there_are():
-    assert torch.allclose(average_pooled(torch.ones(1, 1, 5, 5)), torch.ones(1, 1, 5, 5))
+    assert torch.allclose(average_pool(torch.ones(1, 1, 5, 5)), torch.ones(1, 1, 5, 5))
 
 
 def test_weights_come_from_files(inception, tmp_path):

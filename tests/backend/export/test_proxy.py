@@ -20,7 +20,7 @@ from primdiffusion.export.proxy import (
     write_proxy_arrays,
     write_proxy_glb,
 )
-from primdiffusion.export.simplify import simplified, unwrapped
+from primdiffusion.export.simplify import simplify, unwrap
 from primdiffusion.export.surface import OuterSurface, depth_below, outside_surface
 from primdiffusion.human import framing, place, pose_body
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
@@ -148,7 +148,7 @@ def as_trimesh(surface):
 
 
 def test_a_ball_is_closed_round_and_of_its_size():
-    mesh = as_trimesh(simplified(*outside_surface(merge(ball(0.3), 0.02, points=1)), 3000))
+    mesh = as_trimesh(simplify(*outside_surface(merge(ball(0.3), 0.02, points=1)), 3000))
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert len(mesh.faces) <= 3000
@@ -193,4 +193,4 @@ def test_a_person_of_nothing_is_rejected_with_a_sentence():
 def test_without_xatlas_unwrapping_is_rejected_with_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with refused(MissingPackageError, "xatlas"):
-        unwrapped(np.zeros((3, 3)), np.array([[0, 1, 2]]), 64)
+        unwrap(np.zeros((3, 3)), np.array([[0, 1, 2]]), 64)

@@ -15,7 +15,7 @@ from primdiffusion.files.whole_files import (
     atomic_folder,
     atomic_path,
     atomic_replace,
-    publish,
+    move_into_place,
     remove_abandoned,
     remove_of_process,
     temporary_name,
@@ -85,7 +85,7 @@ def test_a_folder_replaces_a_folder(tmp_path):
     for name in ("made/a", "made/b/x", "made/c", "old/a", "old/b/y"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
-    publish(tmp_path / "made", tmp_path / "old")
+    move_into_place(tmp_path / "made", tmp_path / "old")
     assert contents(tmp_path / "old") == {"a": "made/a", "b/x": "made/b/x", "c": "made/c"}
 
 

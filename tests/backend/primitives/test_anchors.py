@@ -25,7 +25,7 @@ from primdiffusion.primitives.anchors import (
     footprint_anchors,
     grid_points_outside,
     released_half_extent,
-    stretched,
+    stretch,
     tangent_plane,
 )
 from primdiffusion.primitives.primitives import GRID, K
@@ -167,9 +167,9 @@ def test_vertices_that_are_not_finite_are_rejected():
 
 
 def test_boxes_follow_the_skin_where_a_pose_stretches_it():
-    assert torch.equal(stretched(REST, ANCHORS, BODY.template, BODY.template).half_extent, REST.half_extent)
+    assert torch.equal(stretch(REST, ANCHORS, BODY.template, BODY.template).half_extent, REST.half_extent)
     for factor in (0.8, 1.3, LARGEST_STRETCH, 3.0):
-        grown = stretched(REST, ANCHORS, factor * BODY.template, BODY.template).half_extent / REST.half_extent
+        grown = stretch(REST, ANCHORS, factor * BODY.template, BODY.template).half_extent / REST.half_extent
         expected = torch.tensor([min(max(factor, 1.0), LARGEST_STRETCH)] * 2 + [1.0])
         assert torch.allclose(grown, expected.expand_as(grown), rtol=1e-4)
 

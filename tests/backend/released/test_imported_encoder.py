@@ -11,7 +11,6 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.capture.conditioning import captured_person
-from primdiffusion.commands.import_released import read_released
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import load_encoder, unproject_views
@@ -98,16 +97,6 @@ def folder(tmp_path_factory, stage) -> Path:
 @pytest.fixture(scope="module")
 def encoder_file(folder) -> Path:
     return folder / "imported.encoder.safetensors"
-
-
-def test_all_475_tensors_are_imported_checked_or_dropped_with_a_reason(folder):
-    weights, inventory = read_released(folder / "primdiffusion.pt")
-    entries = inventory.account.entries
-    assert [entry.key for entry in entries] == list(weights)
-    fates = {fate: [entry for entry in entries if entry.fate == fate] for fate in ("imported", "checked", "dropped")}
-    assert {fate: len(found) for fate, found in fates.items()} == {"imported": 437, "checked": 12, "dropped": 26}
-    assert {entry.group for entry in fates["dropped"]} == {"lbs_fn", "geo_fn", "decoder_geom"}
-    assert all(entry.note for entry in entries)
 
 
 def test_the_file_holds_the_weights_as_they_were_and_nothing_of_smpl(folder, encoder_file, stage):

@@ -38,6 +38,7 @@ def test_all_475_tensors_are_accounted_for(released):
     assert [entry.key for entry in inventory.account.entries] == list(released)
     fates = {(row["group"], row["fate"]): row["tensors"] for row in inventory.account.groups()}
     assert len(released) == sum(fates.values()) == 475
+    assert all(entry.note for entry in inventory.account.entries), "with a reason"
     assert fates == {
         ("schedule", "checked"): 12, ("lbs_fn", "dropped"): 7, ("geo_fn", "dropped"): 7,
         ("local_pose_conv_block", "imported"): 9, ("joint_conv_block", "imported"): 9, ("embs_encoder", "imported"): 42,

@@ -11,6 +11,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render import merge as merging
 from primdiffusion.render.merge import Merged, merge
 from primdiffusion.render.reference import trilinear, window
+from support.errors import refused
 
 
 def boxes(count: int = 5, seed: int = 0, spread: float = 0.06) -> Primitives:
@@ -114,8 +115,8 @@ def test_boxes_without_extent_or_content_hold_nothing():
 
 @pytest.mark.parametrize(
     ("voxel", "message"),
-    [(0.0, "above zero"), (-1.0, "above zero"), (1e-5, r"choose .* mm or more"), (float("nan"), "above zero")],
+    [(0.0, "above zero"), (-1.0, "above zero"), (1e-5, "mm or more"), (float("nan"), "above zero")],
 )
 def test_voxels_that_cannot_be_are_rejected_with_what_to_do(voxel, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(ValueError, message):
         merge(boxes(), voxel)

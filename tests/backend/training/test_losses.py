@@ -14,7 +14,7 @@ from primdiffusion.training.losses import (
     blend_conditions,
     blends,
     closed_form,
-    mixed,
+    mix,
     random_steps,
     weighted_error,
     x0_errors,
@@ -78,7 +78,7 @@ def test_mixtures_are_weighted_sums_of_two():
     weights = torch.tensor([[1.0, 0.0], [0.3, 0.7], [1.4, -0.4]])
     indices = torch.tensor([[0, 4], [1, 2], [3, 3]])
     expected = torch.einsum("bk,bkcd->bcd", weights, samples[indices].float())
-    torch.testing.assert_close(mixed(samples, weights, indices), expected)
+    torch.testing.assert_close(mix(samples, weights, indices), expected)
 
 
 def test_errors_count_by_the_deviation_of_the_closed_form_with_mean_one_at_every_level():

@@ -12,15 +12,13 @@ from diffuse_runs import settings
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.runtime.failures import MissingPackageError
 from primdiffusion.runtime.worker_process import lock_folder
-from primdiffusion.training.config import NetworkTraining, TrainingConfig, check_resumable, to_json
+from primdiffusion.training.config import TrainingConfig, check_resumable, to_json
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.run_folder import open_metrics
 from support.errors import refused
 from support.runs import rows
-
-FEW = {"local": NetworkTraining(steps=2, batch=2, evaluate_every=2)}
 
 
 @pytest.mark.parametrize(

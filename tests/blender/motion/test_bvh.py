@@ -216,9 +216,8 @@ def test_broken_files_are_named(tmp_path, change, message):
     rotations, moves = motion_of()
     path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, moves, scan_fixtures.MIXAMO)
     path.write_text(change(path.read_text()))
-    with pytest.raises(FileError, match=message) as caught:
+    with refused(FileError, message, str(path)):
         read_motion(path)
-    assert str(path) in str(caught.value)
 
 
 def test_a_file_without_a_frame_time_gets_the_default(tmp_path):

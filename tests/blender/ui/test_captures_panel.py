@@ -11,8 +11,7 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.capture_layout import picture_path
-from blender_primdiffusion.formats.joints import JOINT_NAMES
-from capture_person import _few_faces, chequers, files_of
+from capture_person import files_of, load_painted
 from support.capture_files import faults
 from support.errors import refused
 
@@ -38,21 +37,11 @@ def write_person(path: Path) -> None:
     """A skinned, textured .glb of the default body with few faces."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     body = read_body()
-    vertices, joints = body.rest(np.zeros(10))
-    kept, faces = _few_faces()
-    armature = build_armature("person", points_to_blender(joints))
+    armature = build_armature("person", points_to_blender(body.rest(np.zeros(10))[1]))
     bpy.context.scene.collection.objects.link(armature)
-    mesh = bpy.data.meshes.new("skin")
-    mesh.from_pydata(points_to_blender(vertices[kept]).tolist(), [], faces.tolist())
-    mesh.materials.append(chequers())
-    uv = mesh.uv_layers.new(name="UVMap")
-    uv.data.foreach_set("uv", (vertices[kept][faces.ravel(), :2] / 2 + 0.5).astype(np.float32).ravel())
-    obj = bpy.data.objects.new("skin", mesh)
-    bpy.context.scene.collection.objects.link(obj)
-    for joint, name in enumerate(JOINT_NAMES):
-        group = obj.vertex_groups.new(name=name)
-        for vertex in np.flatnonzero(body.skin_weights[kept, joint] > 0):
-            group.add([int(vertex)], float(body.skin_weights[kept[vertex], joint]), "REPLACE")
+    painted = load_painted(bpy.context, None, body)
+    painted.pose(np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))
+    (obj,) = painted.objects
     obj.parent = armature
     obj.modifiers.new("armature", "ARMATURE").object = armature
     path.parent.mkdir(parents=True)

@@ -171,7 +171,7 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(person, a
         "No part of the body is chosen": lambda: ops.redress(human="Human"),
     }
     for sentence, edit in rejected.items():
-        with pytest.raises(RuntimeError, match=sentence):
+        with refused(RuntimeError, sentence):
             edit()
         assert not queue.busy
     settings().other = humans(addon.scene)[0]

@@ -116,7 +116,7 @@ NEEDED = (
 """A rig needs these to be posed, and one bone of spine, neck and head."""
 UNMATCHED = "has bones that cannot be matched to SMPL's joints"
 NAME_BONES = "name them as one of the rigs that the manual lists under Motion"
-"""What is wrong with a file where `map_bones` fails, and what to do."""
+"""Error and remedy for a file where `map_bones` fails."""
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
 _LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist", "wrist": "hand"}
 """Parts whose direction towards the next part gives their rotation."""

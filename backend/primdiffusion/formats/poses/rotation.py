@@ -224,7 +224,7 @@ def is_standing(heads: Mapping[str, NDArray]) -> NDArray[np.bool_]:
 
 
 def straightness(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
-    """How straight arms and legs are of joints by SMPL's names [F, 3], 0 to 1 [F]: the mean of their ends' distances
+    """Straightness of arms and legs, of joints by SMPL's names [F, 3], 0 to 1 [F]: the mean of their ends' distances
     by their lengths."""
     limbs = []
     for side in ("left", "right"):

@@ -87,7 +87,7 @@ def _weigh_ray(upstream, ray, alpha, depth, g_alpha, g_depth, end_rgb, spacing):
             upstream.constant[ray] -= upstream.rgb[ray, channel] * end_rgb[ray, channel]
 
 
-class _Room(NamedTuple):
+class _Scratch(NamedTuple):
     """Buffers of one thread."""
 
     own: Float32[ndarray, "floats"]
@@ -109,7 +109,7 @@ def adjoin_boxes(
 ):  # fmt: skip
     """Accumulate into `gradients`, which must be zero. Other arguments as in `march_tiles`."""
     payload, geometry = len(gradients.density) > 0, len(gradients.to_local) > 0
-    room = _Room(
+    room = _Scratch(
         np.zeros(4 * size * size * size if payload else 0, np.float32),
         np.zeros(8 if geometry else 0, np.float32), np.zeros(8, np.float32),
         np.empty(LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),

@@ -47,7 +47,7 @@ class ImageRows(NamedTuple):
     first_hit: Float32[ndarray, "r"]
 
 
-class Ends(NamedTuple):
+class SaturationPoints(NamedTuple):
     """The point at which each ray becomes opaque, for the adjoint. Not filled if empty."""
 
     index: Int64[ndarray, "r"]
@@ -60,7 +60,7 @@ class Ends(NamedTuple):
     """Colour of that sample."""
 
 
-class _Room(NamedTuple):
+class _Scratch(NamedTuple):
     """Buffers of one thread, sized for the tile with the most boxes."""
 
     listed: Int64[ndarray, "n"]
@@ -95,7 +95,7 @@ def march_tiles(
     """
     most = seen.max()
     blocks = (most + LANES - 1) // LANES
-    room = _Room(
+    room = _Scratch(
         np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64),
         np.empty(blocks * LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
         np.empty(blocks * LANES * HIT_ROWS, np.float32),
@@ -239,7 +239,7 @@ def _march_ray(picture, ends, ray, pixel, room, listed, first, last, voxels, str
             blue += share * points[4 * slot + 2]
             alpha = 1.0
             if len(ends.index) > 0:
-                _note_end(ends, ray, begin + slot, k, share, points, slot)
+                _record_saturation(ends, ray, begin + slot, k, share, points, slot)
         if before < SURFACE_OPACITY <= alpha:
             first_hit = begin + _slot_of_surface(points, before, slot)
         begin += CHUNK
@@ -352,7 +352,7 @@ def _in_index_order(room, slot, index, alpha, number, voxels, strides, size, spa
 
 
 @part()
-def _note_end(ends, ray, index, box, share, points, slot):
+def _record_saturation(ends, ray, index, box, share, points, slot):
     ends.index[ray], ends.box[ray], ends.share[ray] = index, box, share
     inverse = np.float32(1) / points[4 * slot + 3]
     ends.rgb[ray, 0], ends.rgb[ray, 1] = points[4 * slot] * inverse, points[4 * slot + 1] * inverse

@@ -19,7 +19,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu.adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
 from primdiffusion.render.cpu.compiled import on_all_threads
-from primdiffusion.render.cpu.forward import Ends, ImageRows, march_tiles
+from primdiffusion.render.cpu.forward import ImageRows, SaturationPoints, march_tiles
 from primdiffusion.render.cpu.packing import PackedScene, heaviest_first, pack
 from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
@@ -44,7 +44,7 @@ def march_cpu(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     span: Span | None = None,
 ) -> Rendering:
-    """As `march_reference`, in float32 on the CPU on all processors.
+    """Same as `march_reference`, in float32 on the CPU on all processors.
 
     Differentiable, once, in every tensor of `primitives` and `camera`, from rgb, alpha and depth. The first call on a
     machine compiles (some 10 s, the first backward pass as much again); the result is cached on disk. Memory beyond the
@@ -78,7 +78,7 @@ def count_samples(
 
 def draw_with_ends(
     primitives: Primitives, camera: Camera, settings: MarchSettings
-) -> tuple[Rendering, _View, PackedScene, Ends]:
+) -> tuple[Rendering, _View, PackedScene, SaturationPoints]:
     """Render without gradients; also return the scene with empty cells and the ends of the rays, for derivatives."""
     view = _view(primitives.map(lambda tensor: tensor.detach()), camera, settings, None)
     inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
@@ -97,7 +97,7 @@ class _View(NamedTuple):
     pixel_to_world: Float[Tensor, "3 3"]
     """From a pixel [u, v, 1] to its ray's direction, not normalised."""
     stride: Int64[Tensor, "k"]
-    """In units of the smallest stride, as are all lattice indices here."""
+    """Strides in units of the smallest one, as are all lattice indices here."""
     solid: Bool[Tensor, "k"]
     limits: Int64[ndarray, "r 2"]
     """First and last lattice index of each ray; empty without a span."""
@@ -182,20 +182,20 @@ def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> PackedScene:
         rgb, density, to_local, offset, view.given[0].rotation.detach(), view.stride, view.solid, pixel_to_world,
         view.width, view.height, empty_cells=empty_cells,
     )  # fmt: skip
-    if scene.suspect:
+    if scene.may_be_degenerate:
         check_scene(*view.given)
     return scene
 
 
-def _ends(rays: int) -> Ends:
+def _ends(rays: int) -> SaturationPoints:
     """Allocate for a number of rays."""
-    return Ends(
+    return SaturationPoints(
         np.empty(rays, np.int64), np.empty(rays, np.int32), np.empty(rays, np.float32), np.empty((rays, 3), np.float32)
     )
 
 
 def _draw(
-    view: _View, scene: PackedScene, ends: Ends, counts: Int64[ndarray, "tiles 2"] | None = None
+    view: _View, scene: PackedScene, ends: SaturationPoints, counts: Int64[ndarray, "tiles 2"] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return rgb, alpha, depth and first hit, one row per pixel. Fills `ends` and `counts` unless they are empty."""
     rays = view.width * view.height
@@ -241,8 +241,9 @@ class _March(torch.autograd.Function):
 
 
 def _upstream(
-    ends: Ends, spacing: float, alpha: Tensor, depth: Tensor, g_rgb: Tensor, g_alpha: Tensor, g_depth: Tensor
-) -> Upstream:
+    ends: SaturationPoints,
+    spacing: float, alpha: Tensor, depth: Tensor, g_rgb: Tensor, g_alpha: Tensor, g_depth: Tensor,
+) -> Upstream:  # fmt: skip
     """Gradients of each ray's samples (SPEC 4)."""
     distance, origin, constant = np.empty((3, len(alpha)), np.float32)
     upstream = Upstream(g_rgb.contiguous().numpy(), distance, origin, constant, ends.index, ends.box, ends.share)

@@ -39,7 +39,7 @@ class PackedScene(NamedTuple):
     pixel_to_world: Float64[ndarray, "3 3"]
     size: int
     """Voxels along each side of a box."""
-    suspect: bool
+    may_be_degenerate: bool
     """Whether a box may have NaN, infinite or negative values or an invalid rotation; `check_scene` finds which."""
 
 
@@ -66,10 +66,10 @@ def pack(
     voxels = np.empty(k * 4 * size**3, np.float32)
     low, high = np.empty((k, 3), np.float32), np.empty((k, 3), np.float32)
     rectangle, nearest = np.empty((k, 4), np.int32), np.empty(k)
-    suspect = np.empty(k, np.bool_)
+    may_be_degenerate = np.empty(k, np.bool_)
     local, away, to_world = (value.contiguous().numpy() for value in (to_local, offset, pixel_to_world))
     on_all_threads(
-        _pack_boxes, voxels, low, high, rectangle, nearest, suspect,
+        _pack_boxes, voxels, low, high, rectangle, nearest, may_be_degenerate,
         rgb.contiguous().numpy().reshape(-1), density.contiguous().numpy().reshape(-1), size, local,
         away, rotation.contiguous().numpy(), solid.numpy(), to_world, across, down, empty_cells,
     )  # fmt: skip
@@ -79,7 +79,7 @@ def pack(
     row_start, row_place = row_lists(rectangle[seen], down)
     tile_boxes = boxes_per_tile(rectangle, across, down)
     row_box = seen.astype(np.int32)[row_place]
-    return PackedScene(boxes, rectangle, row_start, row_box, tile_boxes, to_world, size, bool(suspect.any()))
+    return PackedScene(boxes, rectangle, row_start, row_box, tile_boxes, to_world, size, bool(may_be_degenerate.any()))
 
 
 def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
@@ -89,7 +89,7 @@ def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
 
 @kernel
 def _pack_boxes(
-    taken, voxels, low, high, rectangle, nearest, suspect,
+    taken, voxels, low, high, rectangle, nearest, may_be_degenerate,
     rgb, density, size, to_local, offset, rotation, solid, pixel_to_world, across, down, empty_cells,
 ):  # fmt: skip
     corners, to_world, world_to_pixel = np.empty((8, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -97,22 +97,22 @@ def _pack_boxes(
     k = take(taken)
     while k < len(solid):
         _pack_box(
-            voxels, low[k], high[k], rectangle[k], nearest, suspect, rgb, density, size, k, to_local[k], offset[k],
-            rotation[k], solid[k], world_to_pixel, across, down, empty_cells, corners, to_world,
+            voxels, low[k], high[k], rectangle[k], nearest, may_be_degenerate, rgb, density, size, k, to_local[k],
+            offset[k], rotation[k], solid[k], world_to_pixel, across, down, empty_cells, corners, to_world,
         )  # fmt: skip
         k = take(taken)
 
 
 @part()
 def _pack_box(
-    voxels, low, high, rectangle, nearest, suspect, rgb, density, size, k, to_local, offset, rotation, solid,
+    voxels, low, high, rectangle, nearest, may_be_degenerate, rgb, density, size, k, to_local, offset, rotation, solid,
     world_to_pixel, across, down, empty_cells, corners, to_world,
 ):  # fmt: skip
     """Pack box k, given some of its rows; the last two arguments are scratch."""
     count = size**3
     own = density[k * count : (k + 1) * count]
     colour = rgb[3 * k * count : 3 * (k + 1) * count]
-    suspect[k] = _is_suspect(own, colour, to_local, offset, rotation)
+    may_be_degenerate[k] = _may_be_degenerate(own, colour, to_local, offset, rotation)
     rectangle[0], rectangle[1], rectangle[2], rectangle[3] = NOTHING
     for axis in range(3):
         low[axis], high[axis] = -1, 1
@@ -126,7 +126,7 @@ def _pack_box(
 
 
 @part()
-def _is_suspect(density, rgb, to_local, offset, rotation):
+def _may_be_degenerate(density, rgb, to_local, offset, rotation):
     zero, least = np.float32(0), np.float32(0)
     for i in range(len(density)):
         zero += density[i] * np.float32(0)

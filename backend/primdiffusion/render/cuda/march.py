@@ -35,7 +35,7 @@ def march_cuda(
     span: Span | None = None,
     shapes: Shapes = Shapes(),  # noqa: B008
 ) -> Rendering:
-    """As `march_reference`, in float32 on a CUDA device; images [B, H, W].
+    """Same as `march_reference`, in float32 on a CUDA device; images [B, H, W].
 
     `primitives` have one leading dimension, 1 or B (1: all views see the same boxes), `camera` and `span` B.
     Differentiable once in every tensor of primitives and camera. Images and gradients are deterministic. Voxel

@@ -72,7 +72,7 @@ class Marcher:
 
 
 def _versions(primitives: Primitives) -> tuple[tuple[int, int], ...] | None:
-    """What changes when torch changes the tensors in place; None if it does not count that, in inference mode."""
+    """Versions of the tensors, which change with them in place; None in inference mode, where torch counts none."""
     tensors = list(vars(primitives).values())
     if any(tensor.is_inference() for tensor in tensors):
         return None

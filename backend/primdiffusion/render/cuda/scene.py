@@ -1,4 +1,4 @@
-"""What `march_cuda` draws, and how its kernels are launched: boxes packed and placed, listed by tile, marched (SPEC 4).
+"""Scene of `march_cuda`, and the launch of its kernels: boxes packed and placed, listed by tile, marched (SPEC 4).
 
 The lengths of lists, the number of programs of the backward pass and the lattice points in use depend on the scene, and
 are known on the device alone. The host does not wait for them: it launches everything by the `Plan` of the last such
@@ -50,7 +50,7 @@ Drawing = TypeVar("Drawing")
 
 @dataclasses.dataclass(frozen=True)
 class Shapes:
-    """How work is divided into Triton programs; does not change the result."""
+    """Division of work into Triton programs; does not change the result."""
 
     tile: tuple[int, int] = (8, 4)
     """Pixels per program of the forward pass, across and down."""
@@ -189,7 +189,7 @@ class _Lists(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What the backward pass needs of each ray (see `march_tiles`)."""
+    """Values that the backward pass needs of each ray (see `march_tiles`)."""
 
     values: Float[Tensor, "b h w 8"]
     ends: Int[Tensor, "b h w 2"]
