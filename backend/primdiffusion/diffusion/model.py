@@ -156,16 +156,18 @@ class DiffusionModel:
             x = x + self.schedule.signal(t) * self.denoiser.prior.sample(1, generator, condition)
         return x
 
-    def decode(self, x0: Float[Tensor, "*b c h w"]) -> Payload:
+    def decode(self, x0: Float[Tensor, "*b c h w"], kind: Float[Tensor, "b a"] | None = None) -> Payload:
         """The payload of clean samples: colours linear in [0, 1], densities 1/m >= 0, ordinary tensors.
 
-        Hair, hats, plain garments and skin have one colour each, and skirts are whole (`Surfaces`).
+        Hair, hats, plain garments and skin have one colour each, and skirts are whole (`Surfaces`), as people of
+        `kind` have them; None reads it from the samples.
         """
         prior = getattr(self.denoiser, "prior", None)
         if self.surfaces is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):
             return self.codec.to_payload(x0, self.full_density)
         codec, samples = self.codec.codec, x0.reshape(-1, *self.codec.shape)
-        kind = prior.expected_kind(prior.split(samples)[0])
+        if kind is None:
+            kind = prior.expected_kind(prior.split(samples)[0])
         cells = self.surfaces.draw(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
         return payload_from_cells(cells, self.full_density, codec.zone)
 

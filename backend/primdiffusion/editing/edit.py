@@ -113,9 +113,11 @@ def run_sampler(steps: Iterable[SamplerStep], on_step: OnStep | None) -> Float[T
     return final
 
 
-def decode_latents(model: DiffusionModel, x0: Float[Tensor, "1 c h w"]) -> Payload:
-    """Decode one clean latent to a payload on the CPU."""
-    return model.decode(x0[0]).to("cpu")
+def decode_latents(
+    model: DiffusionModel, x0: Float[Tensor, "1 c h w"], kind: Float[Tensor, "1 a"] | None = None
+) -> Payload:
+    """Decode one clean latent to a payload on the CPU, of a person of this kind if it is known."""
+    return model.decode(x0[0], kind).to("cpu")
 
 
 def with_payload(model: DiffusionModel, human: Human, x0: Float[Tensor, "1 c h w"]) -> Human:

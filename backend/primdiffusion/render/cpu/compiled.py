@@ -44,8 +44,18 @@ def kernel(function: Function) -> Any:
     files do. Here the cache stamp covers the content of all of those files.
     """
     dispatcher = _njit(nogil=True, cache=True, fastmath=set(FASTMATH), error_model="numpy")(function)
-    dispatcher._cache._cache_file._source_stamp = _stamp()
+    cache = dispatcher._cache._cache_file
+    cache._source_stamp = _stamp()
+    cache._load_index = functools.partial(_load_index, cache._load_index)
     return dispatcher
+
+
+def _load_index(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:
+    """The kernels that a cache file lists; none if it is of an earlier version and names records that are gone."""
+    try:
+        return load()
+    except (AttributeError, ImportError):
+        return {}
 
 
 def is_compiled(dispatcher: Any) -> bool:
