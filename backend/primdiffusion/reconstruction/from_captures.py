@@ -28,7 +28,7 @@ from primdiffusion.version import __version__
 
 DESCENT = DescentSettings(steps=28, views=3, step=0.015)
 """Gradient descent from the encoder's human."""
-PULLED_DESCENT = DescentSettings(steps=28, views=3, step=0.01, pull=0.04)
+PULLED_DESCENT = DescentSettings(steps=28, views=3, step=0.01, pull=0.04, grow=False)
 """Gradient descent from the prior's human in one view, whose pull each further view outweighs more: without it, the
 given view gains 5 dB and the others lose 2."""
 DESCENT_SIDE = 256
