@@ -28,7 +28,7 @@ from primdiffusion.version import __version__
 
 DESCENT = DescentSettings(steps=28, views=3, step=0.015)
 """Gradient descent from the encoder's human."""
-PULLED_DESCENT = DescentSettings(steps=28, views=3, step=0.01, pull=0.04, grow=False)
+PULLED_DESCENT = DescentSettings(steps=28, views=3, step=0.01, pull=0.04)
 """Gradient descent from the prior's human in one view, whose pull each further view outweighs more: without it, the
 given view gains 5 dB and the others lose 2."""
 DESCENT_SIDE = 256
@@ -119,7 +119,9 @@ def _descended(
         return payload
     stride = math.ceil(max(views.camera.width, views.camera.height) / DESCENT_SIDE)
     together, pull = min(settings.views, len(seen)), settings.pull / len(seen)
-    settings = dataclasses.replace(settings, views=together, stride=stride, pull=pull, largest_density=full_density)
+    settings = dataclasses.replace(
+        settings, views=together, stride=stride, pull=pull, largest_density=full_density, grow=len(seen) > 1
+    )
     return descend(payload, seen, settings)
 
 

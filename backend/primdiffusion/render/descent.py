@@ -58,7 +58,7 @@ class DescentSettings(Checked):
     largest_density: Annotated[float, Range(1)] = FULL_DENSITY
     """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
     grow: bool = True
-    """Whether densities may exceed those of the start: few views grow wisps beside the outlines of others."""
+    """Whether densities may exceed those of the start; one view would grow wisps beside the outlines of others."""
     silhouette: NotNegative = 0.05
     """Weight of the mean square error of the silhouette, relative to that of the colours."""
     pull: NotNegative = 0.0
