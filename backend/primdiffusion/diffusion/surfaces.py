@@ -23,7 +23,7 @@ from torch import Tensor
 
 from primdiffusion.diffusion.codec import SCALE_VALUE, VOXEL_VALUES, window_weight
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.primitives.primitives import S
+from primdiffusion.primitives.primitives import K, S
 
 SURELY = 0.75
 """Share of a surface above which a voxel counts for the surface's colour."""
@@ -124,6 +124,14 @@ class Surfaces(TensorRecord):
             shape = torch.cat([self.dense[own], self.size[own] * SCALE_VALUE], dim=1)
             drawn_cells[person, self.between[own], 3 * S**3 :] = shape
         return drawn_cells
+
+    def hair(self, kind: Float[Tensor, "a"]) -> Float[Tensor, "k 512"]:
+        """How much of each voxel is hair of people of this kind; skin, unlike hair, is not drawn on all its boxes."""
+        skin = torch.zeros_like(self.natural).index_fill(0, self.surface[self.read & ~self.drawn], True)
+        own = (_fitting(kind[None], self.condition)[0] & self.natural & ~skin)[self.surface]
+        hair = self.share.new_zeros(K, S**3)
+        hair[self.cell[own]] = self.share[own]
+        return hair
 
     def _face(self, cells: Float[Tensor, "k v"], skin: Float[Tensor, "3"]) -> Float[Tensor, "f 512 3"]:
         """The face's colours: what it has of its own is smaller on skin darker than the mean."""

@@ -29,8 +29,8 @@ from primdiffusion.version import __version__
 DESCENT = DescentSettings(steps=28, views=3, step=0.015)
 """Gradient descent from the encoder's human."""
 PULLED_DESCENT = DescentSettings(steps=28, views=3, step=0.01, pull=0.04)
-"""Gradient descent from the prior's human in one view, whose pull each further view outweighs more: without it, the
-given view gains 5 dB and the others lose 2."""
+"""Gradient descent from the prior's human, whose pull each view after the second outweighs more: without it, a single
+view gains 5 dB and the others lose 2. One alone is pulled as little as two, because its densities do not grow."""
 DESCENT_SIDE = 256
 """Largest side of the images that its steps draw, pixels: every second pixel of images of 512 pixels."""
 HUMAN_STEPS = FIT_STEPS + 1
@@ -118,8 +118,10 @@ def _descended(
     if not seen:
         return payload
     stride = math.ceil(max(views.camera.width, views.camera.height) / DESCENT_SIDE)
-    together, pull = min(settings.views, len(seen)), settings.pull / len(seen)
-    settings = dataclasses.replace(settings, views=together, stride=stride, pull=pull, largest_density=full_density)
+    together, pull = min(settings.views, len(seen)), settings.pull / max(len(seen), 2)
+    settings = dataclasses.replace(
+        settings, views=together, stride=stride, pull=pull, largest_density=full_density, grow=len(seen) > 1
+    )
     return descend(payload, seen, settings)
 
 

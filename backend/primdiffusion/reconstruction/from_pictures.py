@@ -23,6 +23,7 @@ from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Views, as_camera
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.human import pose_body
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, outline_error, resized
 from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_opencv, outline_in, without_things
@@ -69,6 +70,8 @@ TURN_STEPS = 3
 """Gauss-Newton steps on coefficients before."""
 OUTLINE_IN_PICTURE = 256
 """Largest side of the drawing of a body over a picture without a mask, pixels."""
+CUT_OFF = 0.05
+"""How far a body goes on below its mask, as a share of the mask's height, whose legs are not in the picture."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -150,8 +153,25 @@ def person_in_pictures(
 def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Sequence[str] = ()) -> CapturedPerson:
     """The person in pictures whose posture is known."""
     names, whole_views = [photograph.path.name for photograph in photographs], views_of(photographs, posture.camera)
-    views = _views(photographs, posture)
+    views = whole = _views(photographs, posture)
+    if len(photographs) == 1:
+        views = _above_cut(whole, posture)
+    if views is not whole:
+        warnings = [*warnings, "the picture shows no feet: what is below its lowest part of the person is guessed"]
     return CapturedPerson(names, None, (), views, posture.betas, tuple(warnings), tuple(whole_views))
+
+
+def _above_cut(views: Views, posture: Posture) -> Views:
+    """The rows of one picture down to the lowest of the mask, if the body goes on below: it is there, but not shown."""
+    rows = (views.mask[0] > 127).any(1).nonzero()[:, 0]
+    (pose,), (camera,) = each(posture.pose), each(posture.camera)
+    lowest = camera.project(pose_body(posture.betas, pose).vertices)[0][:, 1].amax()
+    if not len(rows) or lowest - rows[-1] < CUT_OFF * (rows[-1] - rows[0]):
+        return views
+    height = int(rows[-1]) + 1
+    return dataclasses.replace(
+        views, rgba=views.rgba[:, :height], camera=dataclasses.replace(views.camera, height=height)
+    )
 
 
 def start_of(

@@ -28,12 +28,14 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import GaussianOfKinds, PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
+from primdiffusion.diffusion.surfaces import BLACK, SURELY, Surfaces
 from primdiffusion.formats import requests
-from primdiffusion.geometry.image import decode_srgb
-from primdiffusion.primitives.primitives import Frames, Payload, S
+from primdiffusion.geometry.image import decode_srgb, encode_srgb
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives, S
 from primdiffusion.render.cpu.linear import apply_to_codes
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, fit_payload
+from primdiffusion.render.march import march
 
 STARTING_SIDE, STARTING_STEPS = 96, 3
 """Largest side of the pictures, pixels, and Gauss-Newton steps with all people, after which outfits are chosen."""
@@ -69,6 +71,8 @@ PIXEL_STD = 0.08
 PULL, SMOOTHNESS = 2.0, 1.0
 """Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
 many views, they would let one view change what only other sides show."""
+FEWEST_PIXELS = 20
+"""Pixels of hair from which its colour is read."""
 COARSE_SIDE, FINE_SIDE = 176, 256
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
@@ -100,6 +104,7 @@ class PriorFit:
     full_density: float
     decode: Callable[[Tensor], Payload]
     """That of the model, whose surfaces have one colour each, on the CPU."""
+    surfaces: Surfaces | None
     _latest: list = dataclasses.field(default_factory=lambda: [None, None], init=False, repr=False)
 
     @classmethod
@@ -115,9 +120,12 @@ class PriorFit:
         chain = model.chain(model.schedule.length, requests.Sampling.steps)
         codec = model.codec.codec.to("cpu")
         prior, device = model.denoiser.prior.to("cpu"), model.device
-        return cls(
-            model.denoiser, chain, prior, codec, model.full_density, lambda x0: model.decode(x0.to(device)).to("cpu")
-        )
+        surfaces = None if model.surfaces is None else model.surfaces.to("cpu")
+
+        def decode(x0: Tensor) -> Payload:
+            return model.decode(x0.to(device)).to("cpu")
+
+        return cls(model.denoiser, chain, prior, codec, model.full_density, decode, surfaces)
 
     @property
     def start_steps(self) -> int:
@@ -243,6 +251,9 @@ class PriorFit:
         self._forget()
         rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
         start = self.decode(self.prior.join(coefficients[None], rest[None])[0])
+        if self.surfaces is not None:
+            kind = self.prior.expected_kind(coefficients[None])[0]
+            start = with_colour_of(targets, start, self.surfaces.hair(kind))
         payload = fit_payload(start, targets, self.full_density, settings)
         on_step()
         return payload
@@ -319,6 +330,23 @@ class PriorFit:
 def best(candidates: Sequence[Explanation], count: int) -> list[Explanation]:
     """Those that explain the pictures best."""
     return sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
+
+
+def with_colour_of(targets: Sequence[PosedView], human: Payload, part: Float[Tensor, "k 512"]) -> Payload:
+    """The human with a part of it, given as each voxel's share, in the colour that the pictures show there."""
+    share = part.view(-1, 1, S, S, S)
+    marked, drawn, shown = dataclasses.replace(human, rgb=share.expand_as(human.rgb)), [], []
+    for target in targets:
+        amount, picture = (march(Primitives.place(target.frames, one), target.camera).rgb for one in (marked, human))
+        sure = (amount[..., 0] > SURELY) & (target.rgba[..., 3] > SURELY)
+        drawn.append(encode_srgb(picture[sure]))
+        shown.append(encode_srgb(target.rgba[sure][:, :3]))
+    before, after = torch.cat(drawn), torch.cat(shown)
+    if len(before) < FEWEST_PIXELS:
+        return human
+    change = after.median(0).values / before.median(0).values.clamp_min(BLACK) - 1
+    rgb = encode_srgb(human.rgb) * (1 + share * change.view(3, 1, 1, 1))
+    return dataclasses.replace(human, rgb=decode_srgb(rgb.clamp(0, 1)))
 
 
 def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[PosedView]:

@@ -57,6 +57,8 @@ class DescentSettings(Checked):
     """Fraction of the rates at the end of their cosine decay."""
     largest_density: Annotated[float, Range(1)] = FULL_DENSITY
     """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
+    grow: bool = True
+    """Whether densities may exceed those of the start; one view would grow wisps beside the outlines of others."""
     silhouette: NotNegative = 0.05
     """Weight of the mean square error of the silhouette, relative to that of the colours."""
     pull: NotNegative = 0.0
@@ -103,6 +105,8 @@ def descend(
                 loss = loss + settings.pull * torch.stack(far).sum() / covered
         return loss.detach(), *torch.autograd.grad(loss, own)
 
+    largest = settings.largest_density / FULL_DENSITY
+    most = torch.full_like(first[1], largest) if settings.grow else first[1].clamp_max(largest)
     recorded = Recorded(gradients)
     for number in range(1, settings.steps + 1):
         shown = itertools.islice(chosen, settings.views)
@@ -112,7 +116,7 @@ def descend(
             raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
         for (adam, rate), gradient in zip(adams, found, strict=True):
             adam.step([gradient], rate * _share_of_rate(number - 1, settings))
-        leaves.clamp_(settings.largest_density)
+        leaves.clamp_(most)
         on_step()
     return leaves.result(start)
 
@@ -164,10 +168,10 @@ class _Leaves(NamedTuple):
         return Payload(decode_srgb(self.colour), self.density * FULL_DENSITY, scale)
 
     @torch.no_grad()
-    def clamp_(self, largest_density: float) -> None:
+    def clamp_(self, most: Tensor) -> None:
         """Clamp to valid values, after the step: clamping in the forward pass would stop the gradient at the bounds."""
         self.colour.clamp_(0, 1)
-        self.density.clamp_(0, largest_density / FULL_DENSITY)
+        torch.minimum(self.density.clamp_(0), most, out=self.density)
         self.log_scale.clamp_(-math.log(LARGEST_CHANGE), math.log(LARGEST_CHANGE))
 
     @torch.no_grad()

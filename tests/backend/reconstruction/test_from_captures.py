@@ -85,6 +85,29 @@ def test_unseen_sides_have_surfaces_of_one_colour(plain):
     torch.testing.assert_close(after, 0.5 * before, atol=0.02, rtol=0)
 
 
+def test_hair_on_the_back_has_the_colour_that_the_picture_shows_in_front():
+    human = human_of(COLOURS)
+    primitives = place(human, BodyPose.rest())
+    head = (primitives.position[:, 1] > primitives.position[:, 1].max() - 0.3).nonzero()[:, 0]
+    rgb = human.payload.rgb.clone()
+    rgb[head] *= torch.tensor([1.0, 0.4, 0.2]).view(3, 1, 1, 1)
+    person = captured(
+        dataclasses.replace(human, payload=dataclasses.replace(human.payload, rgb=rgb)), BodyPose.rest(), [0.0]
+    )
+    ones, yes = torch.ones(len(head), S**3), torch.ones(len(head), dtype=torch.bool)
+    hair = Surfaces(
+        torch.zeros(1, MODEL.vocabulary.width), torch.tensor([True]), torch.zeros(len(head), dtype=torch.int64),
+        head, ones, ones, yes, yes, *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0], **without_faces_and_skirts(),
+    )  # fmt: skip
+    behind = head[primitives.position[head, 2] < primitives.position[head, 2].median() - 0.05]
+    errors = []
+    for natural in (True, False):  # a garment keeps the colour that the person components give it
+        surfaces = dataclasses.replace(hair, natural=torch.tensor([natural]))
+        found = reconstruct(dataclasses.replace(MODEL, surfaces=surfaces), person).payload
+        errors.append(float((encode_srgb(found.rgb[behind]) - encode_srgb(rgb[behind])).abs().mean()))
+    assert errors[0] < 0.03 < 0.1 < errors[1]
+
+
 def test_the_more_views_the_nearer_the_human_is_to_what_they_show():
     human = human_of(COLOURS)
     noise = torch.rand(human.payload.rgb.shape, generator=torch.Generator().manual_seed(0))
@@ -204,6 +227,8 @@ def test_the_voxels_follow_the_given_view_beyond_the_linear_fit(monkeypatch):
     assert after < 0.8 * before
     behind = frames_of(human).rotation[:, 2, 2] < -0.7
     assert (found.rgb[behind] - linear.rgb[behind]).abs().mean() < 0.01
+    assert bool((found.density <= linear.density).all())
+    assert bool((found.density < linear.density).any())
 
 
 def test_a_seed_draws_the_rest_too(plain, monkeypatch):

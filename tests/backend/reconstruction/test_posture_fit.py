@@ -367,6 +367,23 @@ def test_each_arm_may_be_raised_in_a_picture_from_the_side():
     assert (right > left + 0.5).any()
 
 
+@pytest.mark.parametrize("shown", [1.0, 0.96, 0.7])
+def test_of_a_person_who_is_cut_off_the_rows_below_are_not_shown(shown):
+    posture, rgba = a_posture(), np.full((64, 64, 4), 90, np.uint8)
+    rgba[..., 3] = (255 * seen(posture)[0].rgba[..., 3]).byte()
+    top, bottom = np.flatnonzero((rgba[..., 3] > 127).any(1))[[0, -1]]
+    last = round(top + shown * (bottom - top))
+    rgba[last + 1 :, :, 3] = 0
+    photograph = Photograph(Path("a.png"), rgba, Window(0, 0, 64, 64), 64, 64, None)
+    person = from_pictures.person_in([photograph], posture, ["before"])
+    height = person.views.camera.height
+    assert person.views.rgba.shape[1] == height == (last + 1 if shown < 0.9 else 64)
+    assert np.array_equal(person.views.rgba[0], rgba[:height])
+    assert ["no feet" in warning for warning in person.warnings] == [False, True][: 1 + (shown < 0.9)]
+    both = from_pictures.person_in([photograph] * 2, a_posture(2))
+    assert both.views.rgba.shape[1] == 64
+
+
 def test_hands_of_bent_arms_are_at_the_hips():
     body = default_body().shape(torch.zeros(10)).pose(standing(55.0, 55.0, 0.0, 96.0))
     for side in ("left", "right"):
