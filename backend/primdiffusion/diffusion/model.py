@@ -172,11 +172,17 @@ class DiffusionModel:
         return payload_from_cells(cells, self.full_density, codec.zone)
 
     def read_condition(self, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b a"] | None:
-        """Probabilities of attributes of clean samples, as a condition; None for a model without them."""
+        """Probabilities of attributes of clean samples, as a condition, with garments of one colour plain; None for a
+        model without them."""
         prior = getattr(self.denoiser, "prior", None)
         if not self.vocabulary.width or not isinstance(prior, PersonPrior):
             return None
-        return prior.expected_kind(prior.split(x0)[0])
+        kind = prior.expected_kind(prior.split(x0)[0])
+        for number, one in enumerate(x0):
+            if self.plain_after_all(one[None]):
+                block = self.vocabulary.blocks()["pattern"]
+                kind[number, block] = self.vocabulary.encode({"pattern": "plain"}).to(kind)[block]
+        return kind
 
     def plain_after_all(self, x0: Float[Tensor, "1 c h w"]) -> bool:
         """Whether the prior takes a person for patterned whose garments have one colour each, but for small prints.

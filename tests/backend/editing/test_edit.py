@@ -7,9 +7,10 @@ import json
 import pytest
 import torch
 from diffusion_people import small_model
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.model import DiffusionModel, seeded_generator
 from primdiffusion.diffusion.schedule import early_steps, linear, trailing_steps
-from primdiffusion.editing.edit import edit_generator, edit_timesteps
+from primdiffusion.editing.edit import edit_generator, edit_timesteps, encode_human
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate, inversion_steps, invert, slerp
 from primdiffusion.editing.regions import region_of
@@ -257,6 +258,7 @@ def test_an_interpolation_leaves_its_ends_without_a_jump(human, other):
 
 def test_what_lies_between_has_the_attributes_of_the_nearer_end(monkeypatch):
     model, conditions, denoise = model_of_two_kinds(), [], DiffusionModel.denoise
+    kinds, decode = [], DiffusionModel.decode
     ends = [generate(model, 0, 3, attributes={"sex": sex}) for sex in ("female", "male")]
 
     def noted(self, x, t, condition=None, guidance=1.0):
@@ -264,10 +266,21 @@ def test_what_lies_between_has_the_attributes_of_the_nearer_end(monkeypatch):
         return denoise(self, x, t, condition, guidance)
 
     monkeypatch.setattr(DiffusionModel, "denoise", noted)
+    monkeypatch.setattr(DiffusionModel, "decode", lambda self, x0, kind=None: kinds.append(kind) or decode(self, x0))
     for fraction, nearer in ((0.4, "jeans"), (0.6, "suit")):
         interpolate(model, *ends, fraction, steps=3)
         worn = [model.vocabulary.encode({"outfit": outfit}) for outfit in ("jeans", "suit", nearer)]
         assert torch.stack([row @ outfit for row, outfit in zip(conditions[-1], worn, strict=True)]).min() > 0.99
+        assert kinds[-3][0] @ worn[-1] > 0.99  # then both ends are decoded, to see what was lost
+
+
+def test_clothes_of_one_colour_are_read_as_plain(monkeypatch):
+    words = AttributeVocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
+    model = dataclasses.replace(model_of_two_kinds(), vocabulary=words)
+    woman = encode_human(model, generate(model, 0, 3, attributes={"sex": "female"}))
+    for even, pattern in ((False, "patterned"), (True, "plain")):
+        monkeypatch.setattr(DiffusionModel, "plain_after_all", lambda *_, even=even: even)
+        assert model.read_condition(woman)[0] @ words.encode({"pattern": pattern}) > 0.99
 
 
 def test_betas_are_interpolated_linearly(human, other):
