@@ -34,7 +34,7 @@ from primdiffusion.people.payloads import (
     voxels_from_payload,
 )
 from primdiffusion.people.person import Person, make_person, recolour
-from primdiffusion.people.skirts import box_sizes
+from primdiffusion.primitives.skirts import box_sizes
 from primdiffusion.people.stored_people import PersonVariants, read_payloads
 from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.anchors import attach, default_anchors

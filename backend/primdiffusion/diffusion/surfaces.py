@@ -10,7 +10,7 @@ garment on everybody who has it, in two colours (`training.prints`).
 
 Dark faces would be blotched: what faces differ by is as large as their skin is bright, and in a Gaussian it is as large
 on all. And skirts would be torn: between the legs each person's cloth is at a place of its own, of which boxes show a
-part. But the boxes that are sized for a skirt (`people.skirts`) are nearly as dense on everybody who has it.
+part. But the boxes that are sized for a skirt (`primitives.skirts`) are nearly as dense on everybody who has it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from torch import Tensor
 from primdiffusion.diffusion.codec import SCALE_VALUE, VOXEL_VALUES, window_weight
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import K, S
+from primdiffusion.primitives.skirts import inside_legs
 
 SURELY = 0.75
 """Share of a surface above which a voxel counts for the surface's colour."""
@@ -121,6 +122,8 @@ class Surfaces(TensorRecord):
                 rgb = torch.lerp(rgb, drawn, self.share[own][..., None])
                 drawn_cells[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
             own = its[self.skirt]
+            if surfaces:
+                drawn_cells[person] = _without_other_leg(drawn_cells[person], self.between[own])
             shape = torch.cat([self.dense[own], self.size[own] * SCALE_VALUE], dim=1)
             drawn_cells[person, self.between[own], 3 * S**3 :] = shape
         return drawn_cells
@@ -224,6 +227,16 @@ def without_faces_and_skirts() -> dict[str, Tensor]:
         "dense": voxels,
         "size": voxels[:, :3],
     }
+
+
+def _without_other_leg(cells: Float[Tensor, "k v"], skirt: Int[Tensor, "g"]) -> Float[Tensor, "k v"]:
+    """Cells on the insides of the legs end at a gap, but for those of a skirt: beyond is the other leg, which its own
+    boxes show. On legs that are further apart it would float between them."""
+    bare = inside_legs().to(cells.device).index_fill(0, skirt, False)
+    layers = cells[bare, 3 * S**3 : VOXEL_VALUES].unflatten(1, (S, S**2))
+    cells = cells.clone()
+    cells[bare, 3 * S**3 : VOXEL_VALUES] = layers.cummin(1).values.flatten(1)
+    return cells
 
 
 def _fitting(kind: Float[Tensor, "b x"], condition: Float[Tensor, "n x"]) -> Bool[Tensor, "b n"]:

@@ -43,11 +43,11 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import Person, make_person, recolour
-from primdiffusion.people.skirts import box_sizes
 from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
+from primdiffusion.primitives.skirts import box_sizes
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, fit_colours, fit_payload

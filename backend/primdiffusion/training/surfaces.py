@@ -27,8 +27,8 @@ from primdiffusion.diffusion.surfaces import (
     without_faces_and_skirts,
 )
 from primdiffusion.editing.regions import region_of
-from primdiffusion.people.skirts import box_sizes
 from primdiffusion.primitives.primitives import K, S
+from primdiffusion.primitives.skirts import box_sizes
 from primdiffusion.training.box_colours import (
     CHUNK,
     COVERED,

@@ -11,8 +11,8 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import check_surfaces
 from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, LARGEST, Surfaces, voxels_of, without_faces_and_skirts
 from primdiffusion.editing.regions import region_of
-from primdiffusion.people.skirts import box_sizes
 from primdiffusion.primitives.primitives import GRID, K, S
+from primdiffusion.primitives.skirts import box_sizes, inside_legs
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.surfaces import fit_surfaces
@@ -321,8 +321,12 @@ def test_skirts_are_as_dense_and_as_large_as_those_of_all_people(surfaces):
     between = (sizes != 1).any(1)
     torch.testing.assert_close(worn[between, VALUES - 3 :], sizes[between] * SCALE_VALUE)
     torch.testing.assert_close(voxels_of(worn)[between, :, 3], torch.ones(int(between.sum()), S**3), atol=1e-3, rtol=0)
-    assert torch.equal(worn[~between, 3 * S**3 :], torn[0, ~between, 3 * S**3 :])
-    assert torch.equal(other[:, 3 * S**3 :], torn[1, :, 3 * S**3 :])
+    inside = inside_legs()
+    for drawn, before, ends in ((worn, torn[0], inside & ~between), (other, torn[1], inside)):
+        kept = ~(ends | between) if drawn is worn else ~ends
+        assert torch.equal(drawn[kept, 3 * S**3 :], before[kept, 3 * S**3 :])
+        outwards = voxels_of(torch.stack([before, drawn]))[:, ends, :, 3].unflatten(-1, (S, S**2))
+        assert torch.equal(outwards[1], outwards[0].cummin(-2).values)  # beyond a gap is the other leg
 
 
 def test_cloth_between_the_legs_hides_them_and_is_as_dense_as_on_most_people(codec):

@@ -3,9 +3,9 @@
 import pytest
 import torch
 from primdiffusion.body.model import default_body
-from primdiffusion.people.skirts import HEMS, LARGEST, MARGIN, box_sizes
 from primdiffusion.people.wardrobe import OUTFITS, WORDS
 from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.skirts import HEMS, LARGEST, MARGIN, box_sizes
 
 
 def test_skirts_of_the_wardrobe_are_known():

@@ -9,11 +9,12 @@ from __future__ import annotations
 import functools
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from primdiffusion.body.model import default_body
 from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.primitives import Frames
 
 HEMS = {"blouse and skirt": -0.53, "blouse and long skirt": -0.75}
 """Heights of the lowest boxes behind a skirt, on the default body, metres."""
@@ -33,14 +34,25 @@ def box_sizes(outfit: str) -> Float[Tensor, "k 3"] | None:
     """
     if outfit not in HEMS:
         return None
-    body = default_body()
-    frames = attach(default_anchors(), body.template, body.faces)
-    across = frames.position[:, 0]
-    inside = frames.rotation[:, 0, 2] * across.sign() < -FACING
-    inside &= (frames.position[:, 1] > HEMS[outfit]) & (frames.position[:, 1] < WAIST)
+    frames = _frames()
+    inside = inside_legs() & (frames.position[:, 1] > HEMS[outfit])
     reach = frames.rotation[:, 0].abs() * frames.half_extent
     axis = reach.argmax(1)
-    needed = MARGIN * across.abs() / reach.amax(1)
+    needed = MARGIN * frames.position[:, 0].abs() / reach.amax(1)
     sizes = torch.ones_like(frames.half_extent)
     sizes[inside, axis[inside]] = needed[inside].clamp(1, LARGEST)
     return sizes
+
+
+@functools.cache
+def inside_legs() -> Bool[Tensor, "k"]:
+    """Boxes below the waist that face the other leg, down to the longest hem."""
+    frames = _frames()
+    facing = frames.rotation[:, 0, 2] * frames.position[:, 0].sign() < -FACING
+    return facing & (frames.position[:, 1] < WAIST) & (frames.position[:, 1] > min(HEMS.values()))
+
+
+def _frames() -> Frames:
+    """The boxes of the default body in the rest pose."""
+    body = default_body()
+    return attach(default_anchors(), body.template, body.faces)
