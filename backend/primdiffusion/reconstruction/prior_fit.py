@@ -132,11 +132,8 @@ class PriorFit:
         """Number of times that `start` reports."""
         groups = len(self.prior.log_weight)
         heads = sum(sorted(len(self.prior.heads_of(group)) for group in range(groups))[-BEST_OUTFITS:])
-        return (
-            STARTING_STEPS
-            + min(OUTFITS.candidates, groups) * OUTFITS.steps
-            + min(HEADS.candidates, heads) * HEADS.steps
-        )
+        outfit_steps = min(OUTFITS.candidates, groups) * OUTFITS.steps
+        return STARTING_STEPS + outfit_steps + min(HEADS.candidates, heads) * HEADS.steps
 
     @functools.cached_property
     def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
