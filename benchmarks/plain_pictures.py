@@ -63,13 +63,13 @@ from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.reconstruction.from_captures import reconstruct
 from primdiffusion.reconstruction.from_pictures import (
-    POSE_FILE_TIGHTNESS,
-    Start,
+    POSE_FILE_PRECISION,
+    InitialPose,
     fit_posture_in,
     fit_quality,
+    initial_pose,
     person_in,
     person_in_pictures,
-    start_of,
 )
 from primdiffusion.reconstruction.posture_fit import Posture
 from primdiffusion.reconstruction.posture_start import framed, views_of, write_posture
@@ -130,7 +130,7 @@ def main() -> None:
             case = case_of(captures, name, number % POSES)
             photograph = photographed(case, Path(scratch) / name, Fault())
             if not number:  # compiles the marcher and its gradients
-                fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
+                fit_posture_in(model, [photograph], initial_pose([photograph], model), lambda: None)
             start = given(case, photograph, model, Fault(), number)
             began = time.process_time()
             posture = fit_posture_in(model, [photograph], start, lambda: None).posture
@@ -145,7 +145,7 @@ def main() -> None:
                 "picture_seconds_cpu": seconds,
             }
             if not number % POSES:
-                standing = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None).posture
+                standing = fit_posture_in(model, [photograph], initial_pose([photograph], model), lambda: None).posture
                 row["camera_error_px_standing"] = camera_error(case, photograph, standing)
             for fault_name, fault in FAULTS.items() if number < arguments.robust else ():
                 error, quality = with_fault(model, case, Path(scratch) / f"{name}_{fault_name}", fault, number)
@@ -185,7 +185,7 @@ def reported(model: DiffusionModel, assets: Assets, count: int) -> dict[str, flo
             spoil = SPOILED.get(kind, unspoiled)
             Image.fromarray(spoil(rgba, case, np.random.default_rng(number))).save(path)
             (photograph,) = read_photographs([path])
-            found = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
+            found = fit_posture_in(model, [photograph], initial_pose([photograph], model), lambda: None)
             quality = fit_quality(model, [photograph], found)
             said[kind != GOOD].append(bool(quality.warnings()))
             if kind == GOOD:
@@ -330,7 +330,7 @@ def photographed(case: Case, folder: Path, fault: Fault) -> Photograph:
     return read_photographs([folder / "picture.jpg"], [folder / "mask.png"])[0]
 
 
-def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Fault, seed: int) -> Start:
+def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Fault, seed: int) -> InitialPose:
     """The start from a pose file with errors and no cameras."""
     noise = (
         torch.randn(24, 3, generator=torch.Generator().manual_seed(seed)) * math.radians(fault.degrees) / math.sqrt(3)
@@ -340,7 +340,7 @@ def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Faul
     rotation = torch.cat([turn @ rotation[:1], rotation[1:]])
     pose, betas = BodyPose(rotation[None], torch.zeros(1, 3)), model.shapes.bias.clone()
     camera = framed([photograph], pose, betas, [photograph.lens()])
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False, tilted=True, stated=[False])
+    return InitialPose(Posture(pose, betas, camera), POSE_FILE_PRECISION, complete=False, tilted=True, stated=[False])
 
 
 def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, seed: int) -> tuple[float, float]:

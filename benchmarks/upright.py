@@ -59,7 +59,7 @@ from primdiffusion.people.person import make_person
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.raster.rasterise import figure_from_mesh
 from primdiffusion.reconstruction.from_captures import reconstruct
-from primdiffusion.reconstruction.from_pictures import fit_posture_in, person_in, start_of
+from primdiffusion.reconstruction.from_pictures import fit_posture_in, initial_pose, person_in
 from primdiffusion.reconstruction.posture_fit import Posture, each
 from primdiffusion.reconstruction.posture_start import views_of
 from primdiffusion.render.march import march
@@ -127,7 +127,7 @@ def measured(people: int, of: Callable[..., dict[str, float]]) -> tuple[list[dic
 def of_one(model: DiffusionModel, assets, number: int, folder: Path, sheet: list[np.ndarray]) -> dict[str, float]:
     """Figures of a human from one picture, whose row is added to the sheet."""
     case, began = drawn(assets, number, folder), time.process_time()
-    start = start_of([case.photograph], model)
+    start = initial_pose([case.photograph], model)
     posture = fit_posture_in(model, [case.photograph], start, lambda: None).posture
     seconds = time.process_time() - began
     human = reconstruct(model, person_in([case.photograph], posture))
@@ -166,7 +166,7 @@ def of_sides(model: DiffusionModel, assets, number: int, folder: Path, sheet: li
     cases = [drawn(assets, number, folder, turned, i) for i, turned in enumerate(SIDES.values())]
     photographs = read_photographs([case.photograph.path for case in cases])
     cases = [case._replace(photograph=one) for case, one in zip(cases, photographs, strict=True)]
-    posture = fit_posture_in(model, photographs, start_of(photographs, model), lambda: None).posture
+    posture = fit_posture_in(model, photographs, initial_pose(photographs, model), lambda: None).posture
     poses, cameras = list(each(posture.pose)), list(each(posture.camera))
     front = Posture(posture.pose.map(lambda values: values[:1]), posture.betas, stack(cameras[:1]))
     humans = reconstruct(model, person_in(photographs, posture)), reconstruct(model, person_in(photographs[:1], front))

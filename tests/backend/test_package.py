@@ -18,7 +18,9 @@ def test_the_example_of_each_name_runs_after_those_before_it(tmp_path, checkpoin
     np.savez("walk.npz", poses=np.zeros((6, 72)))
     monkeypatch.setattr("primdiffusion.diffusion.checkpoint.default_checkpoint", lambda: checkpoint)
     monkeypatch.setattr(
-        from_pictures, "ROUNDS", [from_pictures.Round(48, from_pictures.Stage(2, 0.03), steps) for steps in (1, 0)]
+        from_pictures,
+        "FIT_STAGES",
+        [from_pictures.FitStage(48, from_pictures.Stage(2, 0.03), steps) for steps in (1, 0)],
     )
     names = [name for name in pd.__all__ if name != "__version__"]
     parser, seen = doctest.DocTestParser(), {"pd": pd}

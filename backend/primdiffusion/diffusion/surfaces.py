@@ -53,7 +53,7 @@ class Surfaces(TensorRecord):
     and G of skirts."""
 
     condition: Float[Tensor, "l x"]
-    """What all people who have the surface are like: 1 at their values (`AttributeVocabulary.encode`)."""
+    """Attributes of all people who have the surface: 1 at their values (`AttributeVocabulary.encode`)."""
     natural: Bool[Tensor, "l"]
     """Hair and skin, in which there is no more green than red, and no more blue than green."""
     surface: Int[Tensor, "n"]
@@ -61,7 +61,7 @@ class Surfaces(TensorRecord):
     cell: Int[Tensor, "n"]
     """The box."""
     share: Float[Tensor, "n 512"]
-    """How much of a voxel's colour is that of the surface, 0 ... 1, where no later one covers it."""
+    """Share of the surface in a voxel's colour, 0 ... 1, where no later one covers it."""
     tone: Float[Tensor, "n 512"]
     """The voxel's sRGB-encoded colour as a multiple of the surface's."""
     read: Bool[Tensor, "n"]
@@ -75,13 +75,13 @@ class Surfaces(TensorRecord):
     box: Int[Tensor, "m"]
     """The box's place among the N."""
     second: Float[Tensor, "m 512"]
-    """How much of a voxel's colour is the second one, 0 ... 1."""
+    """Share of the second colour in a voxel, 0 ... 1."""
     face: Int[Tensor, "f"]
     """The box."""
     features: Float[Tensor, "f 512 3"]
     """Mean colour of the voxel."""
     by_skin: Float[Tensor, "f 512"]
-    """How much of a change of the skin is one of the voxel: little where eyes are white and lips are red."""
+    """Ratio of the voxel's change of colour to that of the skin: small where eyes are white and lips are red."""
     skin: Float[Tensor, "2 3"]
     """Mean skin, and the darkest."""
     skirt: Int[Tensor, "g"]
@@ -89,9 +89,9 @@ class Surfaces(TensorRecord):
     between: Int[Tensor, "g"]
     """The box between their legs."""
     dense: Float[Tensor, "g 512"]
-    """Its density, as stored in cells."""
+    """Density of that box, as stored in cells."""
     size: Float[Tensor, "g 3"]
-    """Its `delta_scale`."""
+    """Size of that box, as `delta_scale`."""
 
     def draw(self, cells: Float[Tensor, "b k v"], kind: Float[Tensor, "b x"]) -> Float[Tensor, "b k v"]:
         """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour, or
@@ -129,7 +129,7 @@ class Surfaces(TensorRecord):
         return drawn_cells
 
     def hair(self, kind: Float[Tensor, "a"]) -> Float[Tensor, "k 512"]:
-        """How much of each voxel is hair of people of this kind; skin, unlike hair, is not drawn on all its boxes."""
+        """Share of hair in each voxel of people of this kind; skin, unlike hair, is not drawn on all its boxes."""
         skin = torch.zeros_like(self.natural).index_fill(0, self.surface[self.read & ~self.drawn], True)
         own = (_fitting(kind[None], self.condition)[0] & self.natural & ~skin)[self.surface]
         hair = self.share.new_zeros(K, S**3)
@@ -177,7 +177,7 @@ class Surfaces(TensorRecord):
         return (self.tone[boxes][..., None] * colours).clamp(0, 1)
 
     def _second(self, number: int) -> Float[Tensor, "n 512"]:
-        """How much of all voxels is a print's second colour."""
+        """Share of a print's second colour in all voxels."""
         own, second = self.printed == number, torch.zeros_like(self.tone)
         second[self.box[own]] = self.second[own]
         return second
@@ -240,7 +240,7 @@ def _without_other_leg(cells: Float[Tensor, "k v"], skirt: Int[Tensor, "g"]) -> 
 
 
 def _fitting(kind: Float[Tensor, "b x"], condition: Float[Tensor, "n x"]) -> Bool[Tensor, "b n"]:
-    """Which conditions are true of people of these kinds."""
+    """Tell which conditions are true of people of these kinds."""
     return condition.sum(1) - kind @ condition.T < 0.5
 
 
@@ -250,8 +250,8 @@ def voxels_of(cells: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 512 4"]:
 
 
 def seen(voxels: Float[Tensor, "*b 512 4"]) -> Float[Tensor, "*b 512"]:
-    """How much each voxel counts for the colour of its box: as dense as it is, as the marcher's window shows it, and as
-    little as denser layers hide it from outside. Fits leave other colours below a surface."""
+    """Weight of each voxel in the colour of its box: its density, as the marcher's window shows it, as far as denser
+    layers do not hide it from outside. Fits leave other colours below a surface."""
     weight = voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()
     layers = weight.unflatten(-1, (S, S, S))  # from the body outwards
     above = layers.flip(-3).cumsum(-3).flip(-3) - layers

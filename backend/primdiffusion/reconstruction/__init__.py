@@ -1,5 +1,4 @@
 """Humans from views (`from_captures`), by encoder or prior (`prior_fit`), and from plain pictures (`from_pictures`).
 
-How a human stands in them: where it starts from (`posture_start`), how it is refined (`posture_fit`), its file
-(`posture_file`).
+The posture of a human in pictures: its start and its file (`posture_start`), its refinement (`posture_fit`).
 """

@@ -34,7 +34,7 @@ view gains 5 dB and the others lose 2. One alone is pulled as little as two, bec
 DESCENT_SIDE = 256
 """Largest side of the images that its steps draw, pixels: every second pixel of images of 512 pixels."""
 HUMAN_STEPS = FIT_STEPS + 1
-"""How often a human is reported that the prior draws: the steps of its fit and the descent."""
+"""Reports of a human that the prior draws: the steps of its fit and the descent."""
 
 
 def reconstruct(
@@ -69,16 +69,16 @@ def draw_humans(
     seeds: Sequence[int | None],
     on_step: Callable[[], None] = lambda: None,
 ) -> Iterator[Human]:
-    """As `reconstruct`, a human for each seed; what takes longest, the search for outfit and hair, is done once."""
+    """Reconstruct a human for each seed, as `reconstruct`; the slow search for outfit and hair runs once."""
     components, views = PriorFit.of(model), person.views
     if views.pose.translation.ndim > 1:
         frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
     else:
         frames = [default_frames(person.betas, views.pose)] * len(views.rgba)
-    explanation = components.start(views, frames, on_step)
+    estimate = components.start(views, frames, on_step)
     for seed in seeds:
         generator = None if seed is None else torch.Generator().manual_seed(seed)
-        payload = components.fit(views, frames, explanation, on_step, generator)
+        payload = components.fit(views, frames, estimate, on_step, generator)
         payload = _descended(payload, views, frames, PULLED_DESCENT, components.full_density)
         on_step()
         drawn = {} if seed is None else {"seed": seed}
@@ -91,7 +91,7 @@ def _origin(person: CapturedPerson) -> dict[str, Any]:
 
 
 def steps_of(model: EncoderModel | DiffusionModel) -> int:
-    """How often `reconstruct` reports."""
+    """Number of times that `reconstruct` reports."""
     return 0 if isinstance(model, EncoderModel) else PriorFit.of(model).start_steps + HUMAN_STEPS
 
 

@@ -1,7 +1,7 @@
 """A human from plain pictures: what is known of pose, shape and camera is refined, then appearance is fitted.
 
 The two take turns from coarse to fine: the mean human finds the pose roughly by its outline, the person coefficients
-that then explain the pictures (`reconstruction`) give it the colours by which limbs find their places.
+that then explain the pictures (`prior_fit`) give it the colours by which limbs find their places.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from primdiffusion.reconstruction.posture_masks import cut_by_outline, load_open
 from primdiffusion.reconstruction.posture_quality import FitQuality, colour_error, quality_of
 from primdiffusion.reconstruction.posture_start import (
     STANCES,
-    before_cameras,
     cameras_of,
     framed,
+    place_in_camera,
     read_cameras,
     read_posture,
     repeated,
@@ -44,50 +44,50 @@ from primdiffusion.reconstruction.prior_fit import PriorFit, targets_of
 from primdiffusion.render.image import PosedView
 
 
-class Round(NamedTuple):
-    """A stage of the posture and the steps of Gauss-Newton on coefficients after it, both in pictures of one size."""
+class FitStage(NamedTuple):
+    """A refinement of the posture and the Gauss-Newton steps on coefficients after it, both in pictures of one size."""
 
     side: int
-    stage: Stage
+    refinement: Stage
     coefficient_steps: int
 
 
-ROUNDS = (
-    Round(96, Stage(12, 0.04, upright=False), 0), Round(96, Stage(28, 0.03, upright=False), 2),
-    Round(96, Stage(50, 0.02), 2), Round(192, Stage(40, 0.01), 0),
+FIT_STAGES = (
+    FitStage(96, Stage(12, 0.04, upright=False), 0), FitStage(96, Stage(28, 0.03, upright=False), 2),
+    FitStage(96, Stage(50, 0.02), 2), FitStage(192, Stage(40, 0.01), 0),
 )  # fmt: skip
-POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
+POSTURE_STEPS = sum(each.refinement.steps + each.coefficient_steps for each in FIT_STAGES)
 OUTLINE_SIDE = 64
-"""Of the pictures that choose how a standing body stands."""
+"""Side of the pictures that choose the stance of a standing body, pixels."""
 LIKELY_START, LIKELY = 1.8, 1.5
-"""How much worse than the best an outline may be for a turn of the body to be tried, and after the first round."""
+"""Largest ratio of an outline's error to the least for a turn to be tried, and to be kept after the first stage."""
 STANCES_TRIED, STANCE_BLUR = 3, 0.03
-"""In a single picture; the first round leaves the one whose outline is best after a blur by this share of the side: an
-arm beside the true one is better than none."""
+"""Number of stances tried in a single picture, and blur, as a share of its side, after which the first stage keeps the
+one whose outline is best: an arm beside the true one is better than none."""
 OWN_COLOURS = Stage(20, 0.03, upright=False)
-"""Before colours decide on turns, with those of each: limbs find their places."""
+"""Refinement by the colours of each turn, before colours decide on turns: limbs find their places."""
 TURN_STEPS = 3
-"""Gauss-Newton steps on coefficients before."""
+"""Gauss-Newton steps on coefficients before it."""
 OUTLINE_IN_PICTURE = 256
 """Largest side of the drawing of a body over a picture without a mask, pixels."""
 CUT_OFF = 0.05
-"""How far a body goes on below its mask, as a share of the mask's height, whose legs are not in the picture."""
-POSE_FILE_TIGHTNESS = 2.0
-"""Poses of files are known twice as well as a standing body."""
+"""Least length of a body below its mask, as a share of the mask's height, at which its legs are cut off."""
+POSE_FILE_PRECISION = 4.0
+"""Prior precision of poses of files: half the standard deviations of a standing body."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Start:
-    """What is known before pictures are looked at."""
+class InitialPose:
+    """The posture that is known before pictures are looked at."""
 
     posture: Posture
-    """With cameras of the squares that are kept of pictures."""
+    """Poses to try, with cameras of the squares that are kept of pictures."""
     pictures: Sequence[int]
-    """Which picture each pose is of; a picture may have several, of which one is right."""
-    tightness: float
+    """The picture of each pose; a picture may have several, of which one is right."""
+    prior_precision: float
     """See `PostureFit`."""
     complete: bool
-    """Pose and cameras are those of files."""
+    """Whether pose and cameras are from files."""
     tilted: bool
     """See `PostureFit`."""
     stated: Sequence[bool]
@@ -95,11 +95,11 @@ class Start:
 
 
 class Found(NamedTuple):
-    """What a fit found in pictures."""
+    """The result of a fit to pictures."""
 
     posture: Posture
     photographs: Sequence[Photograph]
-    """The pictures, without the parts of their masks that are no person's."""
+    """The pictures, without the parts of their masks that are not the person."""
 
 
 def person_in_pictures(
@@ -123,7 +123,7 @@ def person_in_pictures(
         >>> person.betas.shape
         torch.Size([10])
 
-    Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PriorFit.of`.
+    Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `initial_pose` and `PriorFit.of`.
     """
     pose, cameras = (None if path is None else Path(path) for path in (pose, cameras))
     photographs = read_photographs(
@@ -132,7 +132,7 @@ def person_in_pictures(
         mask_label=mask_label,
         outline=None if pose is None or len(pictures) > 1 else lambda *size: _body_in(model, pose, cameras, size),
     )
-    start, warnings = start_of(photographs, model, pose, cameras), []
+    start, warnings = initial_pose(photographs, model, pose, cameras), []
     if refine:
         found = fit_posture_in(model, photographs, start, on_step)
     elif not start.complete:
@@ -174,15 +174,15 @@ def _above_cut(views: Views, posture: Posture) -> Views:
     )
 
 
-def start_of(
+def initial_pose(
     photographs: Sequence[Photograph],
     model: DiffusionModel,
     pose_path: Path | None = None,
     cameras_path: Path | None = None,
-) -> Start:
+) -> InitialPose:
     """The posture to start from: of the files given, else of a standing body, seen as large as in the pictures.
 
-    Raises FileNotFoundError, and ValueError for files that are no poses or cameras, or not one for each picture.
+    Raises FileNotFoundError, and ValueError for files that are not poses or cameras, or not one for each picture.
     """
     sizes = [(photograph.width, photograph.height) for photograph in photographs]
     known = None if pose_path is None else read_posture(pose_path, sizes)
@@ -196,7 +196,7 @@ def start_of(
         ]
         pictures = [i for i, postures in enumerate(found) for _ in postures]
         posture = _together([one for postures in found for one in postures])
-        return Start(posture, pictures, 1.0, complete=False, tilted=tilted, stated=[stated[i] for i in pictures])
+        return InitialPose(posture, pictures, 1.0, complete=False, tilted=tilted, stated=[stated[i] for i in pictures])
     pose = repeated(known.pose, len(photographs))
     betas = model.shapes.bias.clone() if known.betas is None else known.betas
     if views is None:
@@ -206,7 +206,7 @@ def start_of(
         camera = cameras_of(photographs, views)
     posture, pictures = Posture(pose, betas, camera), range(len(photographs))
     complete = views is not None
-    return Start(posture, pictures, POSE_FILE_TIGHTNESS, complete=complete, tilted=tilted, stated=stated)
+    return InitialPose(posture, pictures, POSE_FILE_PRECISION, complete=complete, tilted=tilted, stated=stated)
 
 
 def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, turned: bool) -> list[Posture]:
@@ -225,7 +225,7 @@ def _standing(photograph: Photograph, model: DiffusionModel, view: View | None, 
             tried.append((outline_error(payload, _targets([photograph], posture, OUTLINE_SIDE)[0]), posture))
         found += sorted(tried, key=lambda one: one[0])[: 1 if turned else STANCES_TRIED]
     likely = [found[one][1] for one in _likely([error for error, _ in found], [0] * len(found), LIKELY_START)]
-    return likely if view is None else [before_cameras(one, cameras_of([photograph], [view])) for one in likely]
+    return likely if view is None else [place_in_camera(one, cameras_of([photograph], [view])) for one in likely]
 
 
 def _together(postures: Sequence[Posture]) -> Posture:
@@ -235,30 +235,30 @@ def _together(postures: Sequence[Posture]) -> Posture:
 
 
 def fit_posture_in(
-    model: DiffusionModel, photographs: Sequence[Photograph], start: Start, on_step: Callable[[], None]
+    model: DiffusionModel, photographs: Sequence[Photograph], start: InitialPose, on_step: Callable[[], None]
 ) -> Found:
-    """The posture in the pictures; deterministic. Things that no body explains are left out of the last round.
+    """The posture in the pictures; deterministic. Things that no body explains are left out of the last stage.
 
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PriorFit.of`.
     """
     components, pictures = PriorFit.of(model), list(start.pictures)
-    fit = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted, stated=start.stated)
+    fit = PostureFit(start.posture, model.shapes, start.prior_precision, tilted=start.tilted, stated=start.stated)
     people = components.everyone()
 
     def targets(side: int) -> list[PosedView]:
         return _targets([photographs[picture] for picture in pictures], fit.posture(), side)
 
-    for number, (side, stage, coefficient_steps) in enumerate(ROUNDS):
+    for number, (side, refinement, coefficient_steps) in enumerate(FIT_STAGES):
         payload = components.payload(components.coefficients(people))
-        if number in (0, len(ROUNDS) - 1) and len(pictures) == len(photographs):
+        if number in (0, len(FIT_STAGES) - 1) and len(pictures) == len(photographs):
             photographs = _cut_out(payload, photographs, targets(side))
-        if number == len(ROUNDS) - 1:
+        if number == len(FIT_STAGES) - 1:
             pairs = zip(photographs, targets(side), strict=True)
             photographs = [
                 one if one.uncut is not None else without_things(payload, one, target) for one, target in pairs
             ]
         several = len(pictures) > len(photographs)
-        fit.refine(payload, targets(side), stage, on_step, shaped=not several)  # a wrong turn would bend the shape
+        fit.refine(payload, targets(side), refinement, on_step, shaped=not several)  # a wrong turn would bend the shape
         if several:
             if coefficient_steps:
                 kept = _turns(components, fit, [photographs[one] for one in pictures], pictures, side)
@@ -268,7 +268,7 @@ def fit_posture_in(
             fit.keep(kept)
             pictures = [pictures[one] for one in kept]
         for _ in range(coefficient_steps):
-            people = components.closer(people, targets(side))
+            people = components.gauss_newton_step(people, targets(side))
             on_step()
     return Found(fit.posture(), photographs)
 
@@ -306,15 +306,15 @@ def _person_in(components: PriorFit, targets: Sequence[PosedView]) -> Payload:
     """The person of any colours that explains pictures best."""
     people = components.everyone()
     for _ in range(TURN_STEPS):
-        people = components.closer(people, targets)
+        people = components.gauss_newton_step(people, targets)
     return components.payload(components.coefficients(people))
 
 
 def fit_quality(model: DiffusionModel, photographs: Sequence[Photograph], found: Found) -> FitQuality:
-    """How well what was found explains the pictures. Raises ValueError as `PriorFit.of`."""
+    """Rate the result of a fit by its pictures. Raises ValueError as `PriorFit.of`."""
     pairs = zip(found.photographs, photographs, strict=True)
     left_out = max(1 - _area(kept) / _area(one) if kept.uncut is None else 0.0 for kept, one in pairs)
-    targets = _targets(found.photographs, found.posture, ROUNDS[0].side)
+    targets = _targets(found.photographs, found.posture, FIT_STAGES[0].side)
     return quality_of(PriorFit.of(model), found.posture, targets, left_out)
 
 
@@ -325,16 +325,16 @@ def _cut_out(payload: Payload, photographs: Sequence[Photograph], targets: Seque
 
 
 def _cut_out_twice(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> Sequence[Photograph]:
-    """As `_cut_out`, by the mean human and then by one with the colours and clothes of the first cut."""
+    """Cut out (`_cut_out`) by the mean human, then by one with the colours and clothes of the first cut."""
     if all(one.uncut is None for one in photographs):
         return photographs
     components = PriorFit.of(model)
     people = components.everyone()
-    for round_ in ROUNDS[:2]:
-        for _ in range(round_.coefficient_steps):
-            people = components.closer(people, _targets(photographs, posture, round_.side))
+    for stage in FIT_STAGES[:2]:
+        for _ in range(stage.coefficient_steps):
+            people = components.gauss_newton_step(people, _targets(photographs, posture, stage.side))
         payload = components.payload(components.coefficients(people))
-        photographs = _cut_out(payload, photographs, _targets(photographs, posture, ROUNDS[-1].side))
+        photographs = _cut_out(payload, photographs, _targets(photographs, posture, FIT_STAGES[-1].side))
     return photographs
 
 
@@ -363,7 +363,7 @@ def _body_in(
 
 
 def _area(photograph: Photograph) -> float:
-    """Of the person, in pixels; 1 where nobody is left."""
+    """Area of the person, pixels; 1 where nobody is left."""
     return max(1.0, photograph.rgba[..., 3].sum(dtype=np.float64) / 255)
 
 

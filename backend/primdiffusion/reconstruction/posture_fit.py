@@ -62,7 +62,7 @@ and Motor Control of Human Movement, table 4.1)."""
 
 
 def deviations(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"]) -> Float[Tensor, "6 v"]:
-    """How far poses [v], and cameras at `camera_height` in their worlds (y up), are from the usual, as standard
+    """Measure how unusual poses [v], and cameras at `camera_height` in their worlds (y up), are, in standard
     deviations: the torso from the vertical, the centre of mass from above the feet, one sole above the other, the left
     and the right sole from the level, and the camera above the floor.
     """
@@ -129,23 +129,23 @@ FOCAL_STD, STATED_FOCAL_STD = 0.35, 0.03
 NEEDED = 3.0
 """Standard deviations from balance from which a known pose is taken to need it: a jump, a seat, a bow. Weights fall as
 those of Geman and McClure."""
-EVIDENCE = 1500.0
+DATA_WEIGHT = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE, LAST_RATE = 0.15, 0.2
 """Step of Adam, standard deviations, and the share of it that is left at the end."""
-BETAS = (0.8, 0.95)
+ADAM_BETAS = (0.8, 0.95)
 """Adam's decay rates."""
 COARSE = MarchSettings(step=0.008)
 
 
 @dataclasses.dataclass(frozen=True)
 class Posture(TensorRecord):
-    """How one human is posed in each of v pictures, and the cameras that see it."""
+    """Poses of one human in v pictures, and the cameras that see it."""
 
     pose: BodyPose
     """[v]."""
     betas: Float[Tensor, "10"]
-    """Of the default body."""
+    """Shape of the default body."""
     camera: Camera
     """[v]."""
 
@@ -184,19 +184,19 @@ class PostureFit:
         self,
         start: Posture,
         shapes: ShapePrior,
-        tightness: float = 1.0,
+        prior_precision: float = 1.0,
         *,
         tilted: bool = True,
         stated: Sequence[bool] = (),
     ) -> None:
-        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well, so may be
-        off balance.
+        """`prior_precision` divides the variances of joints: above 1 where the pose is known well, so may be off
+        balance.
 
         `tilted`: pitch, roll and height of the cameras are unknown; otherwise those of the start are true. `stated`:
         whether the lens of each camera is known; none is by default.
         """
         self._start, self._shapes, self._tilted = start, shapes, tilted
-        self._joint_std = JOINT_STD[:, None] / tightness
+        self._joint_std = JOINT_STD[:, None] / math.sqrt(prior_precision)
         count = len(start.pose.translation)
         self._turn = torch.zeros(count, len(JOINT_NAMES), 3)
         self._move = torch.zeros(count, 3)
@@ -208,7 +208,7 @@ class PostureFit:
         self._shape = torch.linalg.solve_triangular(
             shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
         )[:, 0].clone()  # fmt: skip
-        needed = _deviations(start) / NEEDED if tightness > 1 else torch.zeros(6, count)
+        needed = _deviations(start) / NEEDED if prior_precision > 1 else torch.zeros(6, count)
         self._weights = (1 + needed.square()) ** -2
         self._weights[-1] = self._weights[0]  # a guess of the camera's height does not straighten a bow
 
@@ -254,7 +254,7 @@ class PostureFit:
         pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
         for value in unknowns:
             value.requires_grad_()
-        adam = Adam.of(unknowns, BETAS)
+        adam = Adam.of(unknowns, ADAM_BETAS)
         for step in range(stage.steps):
             blur = stage.blur * max(first.width, first.height) * 0.5 ** (step / stage.steps)
             posture = self._posture()
@@ -264,7 +264,7 @@ class PostureFit:
             prior = torch.cat([value.flatten() for value in priors]).square().sum() / 2
             if upright:
                 prior = prior + (self._weights * _deviations(posture).square()).sum() / 2
-            loss = EVIDENCE * torch.stack(errors).sum() + prior
+            loss = DATA_WEIGHT * torch.stack(errors).sum() + prior
             adam.step(torch.autograd.grad(loss, unknowns), RATE * (1 - (1 - LAST_RATE) * step / stage.steps))
             if on_step is not None:
                 on_step()

@@ -1,4 +1,4 @@
-"""Masks of photographs by the human that is fitted to them: cut out by its outline, without what is no person's.
+"""Masks of photographs by the human that is fitted to them: cut out by its outline, without what is not the person.
 
 GrabCut (Rother, Kolmogorov, Blake 2004) is OpenCV's, from the optional extra `primdiffusion[cutout]`.
 """

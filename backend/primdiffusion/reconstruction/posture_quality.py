@@ -1,4 +1,4 @@
-"""How well a fitted human explains its pictures: one number, and what to do about a bad one.
+"""Quality of a human's fit to its pictures: one number, and what to do about a bad one.
 
 The human is drawn in its posture, with the colours that explain the pictures best. What counts is how far outlines and
 colours differ, whether limbs lie within the mask and hands are where they were put, and whether knees and elbows bend
@@ -52,8 +52,7 @@ EDGE_PX = 1
 """Difference of outlines that does not count, pixels of the small pictures that are compared."""
 PATTERN_PX, HEAD_PX = 11, 3
 """Sides of the squares over which colours of the figure and of its head are compared, in the same pixels: patterns and
-faces are not drawn exactly.
-"""
+faces are not drawn exactly."""
 LARGEST_DIFFERENCE, HEAD_SHARE = 0.1, 0.25
 """Largest difference of encoded colour that counts where pictures of a person are compared, and weight of the head."""
 SKIN_DIFFERENCE = 0.1
@@ -61,7 +60,7 @@ SKIN_DIFFERENCE = 0.1
 FRONT = 0.5
 """Cosine of the angle to the camera from which a body shows face and hands."""
 KNEE_DEGREES, ELBOW_DEGREES = 30.0, 80.0
-"""How far a knee may bend sideways or forward, and an elbow backward: the twist of an upper arm is not seen."""
+"""Largest bends of a knee sideways or forward, and of an elbow backward: the twist of an upper arm is not seen."""
 LIMBS: Mapping[str, tuple[str, ...]] = {
     f"{side} {limb}": tuple(f"{side}_{joint}" for joint in joints)
     for side in ("left", "right")
@@ -76,14 +75,14 @@ LIMBS: Mapping[str, tuple[str, ...]] = {
 
 
 class FitQuality(NamedTuple):
-    """How well a human explains one picture; each value is 0 at best, and `LIMITS` has the largest of good fits."""
+    """Errors of a human in one picture; each value is 0 at best, and `LIMITS` has the largest of good fits."""
 
     outline: float
     """1 - intersection over union of the outlines, but for their edges."""
     colour: float
     """Difference of encoded colour, means over small squares, that nine tenths of the pixels do not exceed."""
     unexplained: float
-    """Share of the mask that is no part of the human, even with wide clothes."""
+    """Share of the mask that is not a part of the human, even with wide clothes."""
     left_out: float
     """Share of the mask that was left out of the fit."""
     outside: float
@@ -118,12 +117,12 @@ class FitQuality(NamedTuple):
         return max(0, math.floor(100 - (100 - LEAST_PERCENT) * share))
 
     def content(self) -> dict[str, Any]:
-        """As posture.json holds it."""
+        """The values, as posture.json holds them."""
         values = {name: round(getattr(self, name), 4) for name in LIMITS}
         return {"percent": self.percent, "worst": self.worst, **values}
 
     def warnings(self) -> list[str]:
-        """What to do, in a sentence, about a fit below LEAST_PERCENT, and about what was left out."""
+        """Say what to do about a fit below LEAST_PERCENT, and about what was left out, in a sentence each."""
         warnings = []
         if self.left_out:
             warnings.append(
@@ -155,13 +154,13 @@ class FitQuality(NamedTuple):
 def quality_of(
     components: PriorFit, posture: Posture, targets: Sequence[PosedView], left_out: float = 0.0
 ) -> FitQuality:
-    """How well a posture explains its pictures: of several, the one that it explains worst.
+    """Rate a posture by its pictures: of several, by the one that it explains worst.
 
     `targets` are small pictures by the posture's own cameras and boxes; `left_out` a share of their masks before.
     """
     people = components.everyone()
     for _ in range(COLOUR_STEPS):
-        people = components.closer(people, targets)
+        people = components.gauss_newton_step(people, targets)
     payload = components.payload(components.coefficients(people))
     found = []
     for pose, target, facing in zip(each(posture.pose), targets, posture.facing.tolist(), strict=True):
@@ -174,7 +173,7 @@ def quality_of(
 def colour_error(payload: Payload, target: PosedView) -> float:
     """Mean difference of encoded colour over the figure and over its head, of means over small squares.
 
-    A limb that is elsewhere is no worse than LARGEST_DIFFERENCE.
+    A limb that is elsewhere counts as LARGEST_DIFFERENCE at most.
     """
     _, difference, inner = _compared(payload, target)
     differs = _mean_around(difference, inner, HEAD_PX).abs().mean(-1)
@@ -243,7 +242,7 @@ def _hands_and_skin(limbs: Mapping[str, Float[Tensor, "H W"]], target: PosedView
 
 
 def _mean(values: Float[Tensor, "H W c"], weights: Float[Tensor, "H W"]) -> Float[Tensor, "c"]:
-    """By weights; 0 where they are."""
+    """Mean by weights; 0 where they are."""
     return (values * weights[..., None]).sum((0, 1)) / weights.sum().clamp_min(1e-6)
 
 
@@ -255,7 +254,7 @@ def _mean_around(values: Float[Tensor, "H W 3"], inner: Bool[Tensor, "H W"], sid
 
 
 def _limbs_drawn(payload: Payload, target: PosedView) -> dict[str, Float[Tensor, "H W"]]:
-    """What the boxes of each limb contribute to the pixels."""
+    """Contribution of the boxes of each limb to the pixels."""
     limbs, drawn = list(LIMBS), []
     for first in range(0, len(limbs), 3):
         marked = torch.zeros_like(payload.rgb)

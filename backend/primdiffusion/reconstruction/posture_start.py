@@ -1,4 +1,4 @@
-"""Where a posture starts from: a pose file or a standing body, and cameras of a file or framed by the masks.
+"""The start of a posture: a pose file or a standing body, and cameras of a file or framed by the masks.
 
 A posture that was found is written to a file from which another fit can start.
 """
@@ -17,10 +17,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.body.model import BodyPose, default_body, read_motion
+from primdiffusion.body.model import LARGEST_BETA, BodyPose, default_body, read_motion
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph
 from primdiffusion.capture.reader import as_camera, windowed_view
+from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import FileError, as_file_error
 from primdiffusion.files.whole_files import write_atomically
@@ -39,11 +40,10 @@ STANCES: Sequence[tuple[float, Sequence[tuple[float, ...]]]] = (
     (0, _ACROSS), (180, _ACROSS),
     *((side, stances) for side in (90, 270) for stances in (_ALONG, *((raised,) for raised in _RAISED))),
 )  # fmt: skip
-"""What a standing body may look like: degrees that it is turned to its left, and arguments of `standing`, of which the
-best are tried. From the side, outlines do not tell which arm is raised.
-"""
+"""Stances of a standing body: degrees that it is turned to its left, and arguments of `standing`, of which the best
+are tried. From the side, outlines do not tell which arm is raised."""
 TWIST = 0.4
-"""Of an upper arm, by the angle of its elbow, where a hand is at the hip."""
+"""Twist of an upper arm, by the angle of its elbow, where a hand is at the hip."""
 FRAMING_STEPS = 4
 """Distance and place are found together, because near parts look larger."""
 NEAREST, FARTHEST = 1.0, 1e3
@@ -57,7 +57,7 @@ def cameras_of(photographs: Sequence[Photograph], views: Sequence[View]) -> Came
 
 
 def views_of(photographs: Sequence[Photograph], camera: Camera) -> list[View]:
-    """The inverse: cameras of whole pictures."""
+    """Cameras of whole pictures: the inverse of `cameras_of`."""
     views = []
     for photograph, one in zip(photographs, each(camera), strict=True):
         window, intrinsics = photograph.window, one.intrinsics.double().clone()
@@ -146,8 +146,8 @@ def turned_to_camera(pose: BodyPose) -> BodyPose:
     return BodyPose(rotation, torch.zeros_like(pose.translation))
 
 
-def before_cameras(posture: Posture, camera: Camera) -> Posture:
-    """The same humans, standing before other cameras as they stand before their own."""
+def place_in_camera(posture: Posture, camera: Camera) -> Posture:
+    """Move humans before other cameras, where they stand as before their own."""
     own, other = posture.camera.world_to_camera, camera.world_to_camera
     turn = other[:, :, :3].mT @ own[:, :, :3]
     rotation = posture.pose.joint_rotation
@@ -167,13 +167,11 @@ def repeated(pose: BodyPose, count: int) -> BodyPose:
 
 
 FORMAT = "primdiffusion-posture"
-BETAS = 10
-LARGEST_BETA = 5.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PostureFile:
-    """What a pose file says; only our own say more than poses."""
+    """Content of a pose file; only our own hold more than poses."""
 
     pose: BodyPose
     """[n]."""
@@ -185,7 +183,7 @@ class PostureFile:
 def read_posture(path: Path, sizes: Sequence[tuple[int, int]]) -> PostureFile:
     """Read a pose file (`primdiffusion.body.model`) or a posture of pictures of `sizes` (width, height).
 
-    Raises FileNotFoundError, and ValueError for what is no pose or of another rig; the message names the file.
+    Raises FileNotFoundError, and ValueError for what is not a pose or of another rig; the message names the file.
     """
     pose = read_motion(path)
     content = read_json(path) if path.suffix.lower() == ".json" else None

@@ -41,28 +41,28 @@ STARTING_SIDE, STARTING_STEPS = 96, 3
 """Largest side of the pictures, pixels, and Gauss-Newton steps with all people, after which outfits are chosen."""
 
 
-class Trial(NamedTuple):
-    """A round of candidates: outfits, then those with their hair styles."""
+class SearchStage(NamedTuple):
+    """A stage of the search for the people nearest to a human: outfits, then outfits with hair styles."""
 
-    count: int
-    """Candidates, those that explain the pictures best by the linearisation before."""
+    candidates: int
+    """Number of those that explain the pictures best by the linearisation before."""
     side: int
     """Largest side of the pictures, pixels."""
     steps: int
     """Gauss-Newton steps of each."""
 
 
-OUTFITS, HEADS = Trial(6, 96, 2), Trial(4, 128, 2)
+OUTFITS, HEADS = SearchStage(candidates=6, side=96, steps=2), SearchStage(candidates=4, side=128, steps=2)
 BEST_OUTFITS = 2
 """Outfits that are tried with their hair styles."""
 DIRECTIONS = 128
 """Leading directions of an outfit's people in which its coefficients are sought."""
-TRIAL_VIEWS = 2
-"""Views, evenly spaced, that trials look at."""
+SEARCH_VIEWS = 2
+"""Views, evenly spaced, that the search looks at."""
 STEPS = 2
 """Gauss-Newton steps from there, in all views."""
 FIT_STEPS = STEPS + 1
-"""How often `PriorFit.fit` reports."""
+"""Number of times that `PriorFit.fit` reports."""
 OBSERVATIONS = 150.0
 """Number of independent pixels that a view counts as. What person components cannot draw differs over patches, not over
 pixels; more would fit them to noise, fewer would ignore the view."""
@@ -81,8 +81,8 @@ Kind = tuple[int, int | None]
 """An outfit and a head, or all heads."""
 
 
-class Explanation(NamedTuple):
-    """People of one outfit, or of one outfit and head, or all people (None), after a step of Gauss-Newton."""
+class PosteriorEstimate(NamedTuple):
+    """People of one outfit, or of one outfit and head, or all people (None), after a Gauss-Newton step."""
 
     group: int | None
     head: int | None
@@ -103,14 +103,14 @@ class PriorFit:
     codec: LinearCodec
     full_density: float
     decode: Callable[[Tensor], Payload]
-    """That of the model, whose surfaces have one colour each, on the CPU."""
+    """Decoder of the model, whose surfaces have one colour each, on the CPU."""
     surfaces: Surfaces | None
     _latest: list = dataclasses.field(default_factory=lambda: [None, None], init=False, repr=False)
 
     @classmethod
     @functools.lru_cache(maxsize=1)  # the directions of all people take a second
     def of(cls, model: DiffusionModel) -> PriorFit:
-        """Those of a model; ValueError if it has none, or is of another body than the default one."""
+        """Components of the model's person prior. Raises ValueError if it has none, or is not of the default body."""
         if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
             raise ValueError("the model has no person components: give a checkpoint of the default architecture")
         if model.body_setup is not None:
@@ -129,11 +129,11 @@ class PriorFit:
 
     @property
     def start_steps(self) -> int:
-        """How often `start` reports."""
+        """Number of times that `start` reports."""
         groups = len(self.prior.log_weight)
         heads = sum(sorted(len(self.prior.heads_of(group)) for group in range(groups))[-BEST_OUTFITS:])
-        trials = min(OUTFITS.count, groups) * OUTFITS.steps + min(HEADS.count, heads) * HEADS.steps
-        return STARTING_STEPS + trials
+        outfit_steps = min(OUTFITS.candidates, groups) * OUTFITS.steps
+        return STARTING_STEPS + outfit_steps + min(HEADS.candidates, heads) * HEADS.steps
 
     @functools.cached_property
     def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
@@ -163,51 +163,55 @@ class PriorFit:
             codes[self.prior.part == part] = (basis.flatten(1).T @ own.T).unflatten(0, basis.shape[1:])
         return kinds, codes.numpy()
 
-    def coefficients(self, explanation: Explanation) -> Float[Tensor, "r"]:
-        """Person coefficients of these people."""
-        kinds, _ = self._kinds(explanation.group, explanation.head)
-        return kinds.mean + explanation.weights @ kinds.factor
+    def coefficients(self, estimate: PosteriorEstimate) -> Float[Tensor, "r"]:
+        """Person coefficients of an estimate."""
+        kinds, _ = self._kinds(estimate.group, estimate.head)
+        return kinds.mean + estimate.weights @ kinds.factor
 
     def payload(self, coefficients: Float[Tensor, "r"]) -> Payload:
         """Decode."""
         latents = self.prior.mean + self.prior.picture(coefficients[None])
         return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
 
-    def start(self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None) -> Explanation:
+    def start(
+        self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None
+    ) -> PosteriorEstimate:
         """The people nearest to the human in views with these frames; reports `start_steps` times."""
-        every, steps = math.ceil(len(frames) / TRIAL_VIEWS), self.start_steps
+        every, steps = math.ceil(len(frames) / SEARCH_VIEWS), self.start_steps
 
-        def stepped(people: Explanation, side: int, count: int) -> Explanation:
+        def refine(people: PosteriorEstimate, side: int, count: int) -> PosteriorEstimate:
             nonlocal steps
             for _ in range(count):
-                people, steps = self.closer(people, targets_of(views, frames, side)[::every]), steps - 1
+                people, steps = self.gauss_newton_step(people, targets_of(views, frames, side)[::every]), steps - 1
                 on_step()
             return people
 
-        def tried(people: Sequence[Explanation], kinds: Sequence[Sequence[Kind]], trial: Trial) -> list[Explanation]:
-            targets = targets_of(views, frames, trial.side)[::every]
+        def search(
+            people: Sequence[PosteriorEstimate], kinds: Sequence[Sequence[Kind]], stage: SearchStage
+        ) -> list[PosteriorEstimate]:
+            targets = targets_of(views, frames, stage.side)[::every]
             found = [one for each, own in zip(people, kinds, strict=True) for one in self.within(each, own, targets)]
-            chosen = best(found, trial.count)
-            return [stepped(self._mean_of(one.group, one.head), trial.side, trial.steps) for one in chosen]
+            chosen = best(found, stage.candidates)
+            return [refine(self._mean_of(one.group, one.head), stage.side, stage.steps) for one in chosen]
 
-        people = stepped(self.everyone(), STARTING_SIDE, STARTING_STEPS)
+        people = refine(self.everyone(), STARTING_SIDE, STARTING_STEPS)
         groups = [(group, None) for group in range(len(self.prior.log_weight))]
-        outfits = best(tried([people], [groups], OUTFITS), BEST_OUTFITS)
+        outfits = best(search([people], [groups], OUTFITS), BEST_OUTFITS)
         heads = [[(int(one.group or 0), head) for head in self.prior.heads_of(int(one.group or 0))] for one in outfits]
-        found = best(tried(outfits, heads, HEADS), 1)[0]
+        found = best(search(outfits, heads, HEADS), 1)[0]
         for _ in range(steps):  # of outfits with fewer hair styles than others
             on_step()
         return found
 
     def within(
-        self, explanation: Explanation, kinds: Sequence[Kind], targets: Sequence[PosedView]
-    ) -> list[Explanation]:
-        """How well kinds of the people explain pictures that are linearised at these weights, without their weights.
+        self, estimate: PosteriorEstimate, kinds: Sequence[Kind], targets: Sequence[PosedView]
+    ) -> list[PosteriorEstimate]:
+        """Evidence of kinds of the people, without their weights, in pictures that are linearised at these weights.
 
         Kinds are seen in the directions of the people: fast, and near enough to choose those worth a step of their own.
         """
-        of, _ = self._kinds(explanation.group, explanation.head)
-        precision, vector, misfit = self._information(explanation, targets)
+        of, _ = self._kinds(estimate.group, estimate.head)
+        precision, vector, misfit = self._information(estimate, targets)
         precision, vector, into = precision.double(), vector.double(), torch.linalg.pinv(of.factor)
         found = []
         for group, head in kinds:
@@ -217,90 +221,90 @@ class PriorFit:
             spread = torch.eye(len(mean)) + covariance @ precision
             gain = slope @ torch.linalg.solve(spread, covariance @ slope) - torch.linalg.slogdet(spread).logabsdet
             evidence = float(gain / 2 + (vector + slope) @ mean / 2) - misfit
-            found.append(Explanation(group, head, mean.new_zeros(0), evidence))
+            found.append(PosteriorEstimate(group, head, mean.new_zeros(0), evidence))
         return found
 
-    def everyone(self) -> Explanation:
+    def everyone(self) -> PosteriorEstimate:
         """All people, at the mean human."""
         return self._mean_of(None, None)
 
-    def _mean_of(self, group: int | None, head: int | None) -> Explanation:
+    def _mean_of(self, group: int | None, head: int | None) -> PosteriorEstimate:
         kinds, _ = self._kinds(group, head)
-        return Explanation(group, head, torch.zeros(len(kinds.factor)), 0.0)
+        return PosteriorEstimate(group, head, torch.zeros(len(kinds.factor)), 0.0)
 
     def fit(
         self,
         views: Views,
         frames: Sequence[Frames],
-        explanation: Explanation,
+        estimate: PosteriorEstimate,
         on_step: Callable[[], None] = lambda: None,
         generator: torch.Generator | None = None,
     ) -> Payload:
         """The human in views with these frames: STEPS steps from there, then voxels. Reports FIT_STEPS times.
 
-        With a generator, coefficients are drawn from their distribution given the views, and the rest from that given
-        the coefficients, instead of their means: what no view shows varies with it.
+        With a generator, coefficients are drawn from their distribution given the views, and the residual from that
+        given the coefficients, instead of their means: what no view shows varies with it.
         """
         targets = targets_of(views, frames, COARSE_SIDE)
         for step in range(STEPS):
-            explanation = self.closer(explanation, targets, generator if step == STEPS - 1 else None)
+            estimate = self.gauss_newton_step(estimate, targets, generator if step == STEPS - 1 else None)
             on_step()
         targets = targets_of(views, frames, FINE_SIDE)
         settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
-        coefficients = self.coefficients(explanation)
+        person = self.coefficients(estimate)
         self._forget()
-        rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
-        start = self.decode(self.prior.join(coefficients[None], rest[None])[0])
+        residual = self.mean_residual(person) if generator is None else self.sample_residual(person, generator)
+        start = self.decode(self.prior.join(person[None], residual[None])[0])
         if self.surfaces is not None:
-            kind = self.prior.expected_kind(coefficients[None])[0]
+            kind = self.prior.expected_kind(person[None])[0]
             start = with_colour_of(targets, start, self.surfaces.hair(kind))
         payload = fit_payload(start, targets, self.full_density, settings)
         on_step()
         return payload
 
-    def expected_rest(self, coefficients: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
-        """The mean rest of humans with these coefficients: what the network makes of noise alone."""
+    def mean_residual(self, coefficients: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
+        """Mean residual of humans with these coefficients: what the network makes of noise alone."""
         noise = gaussian_noise(self.prior.mean[None], torch.Generator().manual_seed(0))
-        return self._denoised_rest(noise, self.denoiser.schedule.length - 1, coefficients)[0]
+        return self._denoise_residual(noise, self.denoiser.schedule.length - 1, coefficients)[0]
 
-    def drawn_rest(self, coefficients: Float[Tensor, "r"], generator: torch.Generator) -> Float[Tensor, "c h w"]:
-        """The rest of a human with these coefficients, drawn by DDIM."""
+    def sample_residual(self, coefficients: Float[Tensor, "r"], generator: torch.Generator) -> Float[Tensor, "c h w"]:
+        """Draw the residual of a human with these coefficients, by DDIM."""
         schedule, noise = self.denoiser.schedule, gaussian_noise(self.prior.mean[None], generator)
 
         def denoise(x: Tensor, t: int) -> Tensor:
-            return self._denoised_rest(x, t, coefficients)
+            return self._denoise_residual(x, t, coefficients)
 
         *_, last = ddim(denoise, schedule, schedule.noise(self.chain[0]) * noise, self.chain, generator)
         return last.x0[0]
 
-    def _denoised_rest(self, x: Float[Tensor, "1 c h w"], t: int, coefficients: Float[Tensor, "r"]) -> Tensor:
-        """The clean guess of a rest that holds noise of step t."""
+    def _denoise_residual(self, x: Float[Tensor, "1 c h w"], t: int, coefficients: Float[Tensor, "r"]) -> Tensor:
+        """Clean estimate of a residual that holds noise of step t."""
         device = self.denoiser.component_std.device
         level, person = torch.tensor([t], device=device), coefficients[None].to(device)
         with torch.inference_mode():
-            rest = self.denoiser.rest(self.prior.outside(x).to(device), person, level)
-        return self.prior.outside(rest.cpu().clone())
+            residual = self.denoiser.rest(self.prior.outside(x).to(device), person, level)
+        return self.prior.outside(residual.cpu().clone())
 
-    def closer(
-        self, explanation: Explanation, targets: Sequence[PosedView], generator: torch.Generator | None = None
-    ) -> Explanation:
-        """A step of Gauss-Newton from these weights, to their posterior mean or, with a generator, to a draw."""
-        precision, vector, misfit = self._information(explanation, targets)
+    def gauss_newton_step(
+        self, estimate: PosteriorEstimate, targets: Sequence[PosedView], generator: torch.Generator | None = None
+    ) -> PosteriorEstimate:
+        """Step from these weights to their posterior mean or, with a generator, to a draw."""
+        precision, vector, misfit = self._information(estimate, targets)
         factor = torch.linalg.cholesky(precision.double() + torch.eye(len(vector)))
         mean = torch.cholesky_solve(vector.double()[:, None], factor)[:, 0]
         evidence = float(mean @ vector.double()) / 2 - float(factor.diagonal().log().sum()) - misfit
         if generator is not None:
             noise = torch.randn(len(mean), 1, generator=generator, dtype=mean.dtype)
             mean = mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
-        return Explanation(explanation.group, explanation.head, mean.float(), evidence)
+        return PosteriorEstimate(estimate.group, estimate.head, mean.float(), evidence)
 
     def _information(
-        self, explanation: Explanation, targets: Sequence[PosedView]
+        self, estimate: PosteriorEstimate, targets: Sequence[PosedView]
     ) -> tuple[Float[Tensor, "n n"], Float[Tensor, "n"], float]:
         """Pictures, linearised at these weights: their log probability is vector w - w precision w / 2 - misfit."""
         prior, codec = self.prior, self.codec
-        kinds, codes = self._kinds(explanation.group, explanation.head)
-        weights = explanation.weights
+        kinds, codes = self._kinds(estimate.group, estimate.head)
+        weights = estimate.weights
         latents = prior.mean + prior.picture((kinds.mean + weights @ kinds.factor)[None])
         cells = codec.decode(latents)[0].requires_grad_()
         payload = payload_from_cells(cells, self.full_density, codec.zone)
@@ -327,8 +331,8 @@ class PriorFit:
         return precision, vector, misfit
 
 
-def best(candidates: Sequence[Explanation], count: int) -> list[Explanation]:
-    """Those that explain the pictures best."""
+def best(candidates: Sequence[PosteriorEstimate], count: int) -> list[PosteriorEstimate]:
+    """The candidates that explain the pictures best."""
     return sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
 
 

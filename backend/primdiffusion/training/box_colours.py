@@ -26,7 +26,7 @@ UNEVEN = 0.04
 SURROUNDED = 0.7
 """Share of a box and its neighbours that a garment covers, above which the box is the garment's too."""
 FEWEST_BOXES = 24
-"""Of a garment, or of skin: socks and collars are too few to tell from chance."""
+"""Fewest boxes of a garment, or of skin: socks and collars are too few to tell from chance."""
 
 
 class Meeting(NamedTuple):
@@ -56,7 +56,7 @@ class Meeting(NamedTuple):
         return cls(normal, by_design, total, square, weight, torch.tensor(len(design)))
 
     def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
-        """How much of a voxel each surface is, and its tone."""
+        """Share of each surface in a voxel, and the voxel's tone."""
         slopes = torch.linalg.solve(self.normal, self.by_design[..., None])[..., 0].clamp_min(0)
         slopes = torch.stack([smooth(slope) for slope in slopes.unbind(-1)], dim=-1)
         shares = slopes / slopes.sum(-1, keepdim=True).clamp_min(1e-6)
@@ -73,7 +73,7 @@ class Meeting(NamedTuple):
         return (error * weight).sum(1), (spread * weight).sum(1)
 
     def _products(self, shares: Float[Tensor, "k 512 q"]) -> tuple[Float[Tensor, "k 512"], Float[Tensor, "k 512"]]:
-        """Of mixtures with the voxels, and with themselves."""
+        """Products of mixtures with the voxels, and with themselves."""
         power = torch.einsum("kvq,qr,kvr->kv", shares, self.normal, shares)
         return (shares * self.by_design).sum(-1), power.clamp_min(1e-6)
 

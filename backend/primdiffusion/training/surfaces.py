@@ -50,21 +50,21 @@ from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.prints import FEWEST_GEOMETRIES, Print, find_prints
 
 NO_HAIR, ALL_HAIR = 0.4, 0.8
-"""Slopes of a voxel's colour on the hair's, as shares of its tone: below is no hair, above all of it is."""
+"""Slopes of a voxel's colour on the hair's, as shares of its tone: below it is not hair, above all of it is."""
 FEWEST_VOXELS, SOLID = 8, 0.3
 """Voxels of hair, as dense as that, in a box; fewer are chance."""
 BALD = 0.3
 """Share of the variance of hair that is not the skin's; with less the head is bald."""
 UNEVEN_GARMENT = 0.0136
-"""The same in the median over a garment's boxes: more are prints and fades, which plain garments may have too."""
+"""Largest unevenness of a plain garment; more are prints and fades, which plain garments may have too."""
 SMALL, UNEVEN_SMALL = 80, 0.03
 """Boxes of a garment without fades, of which others leave little, and the same of it: a shirt below a jacket."""
 UNEVEN_BORDER = 0.12
-"""The same of voxels where surfaces meet, in boxes that are wholly explained by them."""
+"""Largest rms difference of voxels where surfaces meet, in boxes that are wholly explained by them."""
 UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
 LEAST_SHARE = 0.05
-"""Of a voxel: less is chance."""
+"""Least share of a surface in a voxel: less is chance."""
 NO_CLOTH, ALL_CLOTH = 0.1, 0.43
 """Shares of a garment between the legs, below which there is none, and above which it hides all else."""
 DENSE = 0.9

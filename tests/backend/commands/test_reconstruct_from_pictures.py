@@ -31,9 +31,9 @@ COLOURS = torch.tensor([30.0, -20.0, 5.0])
 @pytest.fixture(autouse=True, scope="module")
 def short():
     """Few steps in small pictures."""
-    rounds = [from_pictures.Round(48, from_pictures.Stage(4, 0.03), steps) for steps in (1, 0)]
+    stages = [from_pictures.FitStage(48, from_pictures.Stage(4, 0.03), steps) for steps in (1, 0)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(from_pictures, "ROUNDS", rounds)
+        patch.setattr(from_pictures, "FIT_STAGES", stages)
         patch.setattr(from_captures, "PULLED_DESCENT", dataclasses.replace(from_captures.PULLED_DESCENT, steps=4))
         yield
 

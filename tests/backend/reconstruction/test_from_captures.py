@@ -167,7 +167,7 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
     frames = [frames_of(human)]
     from_mean = components.everyone()
     for _ in range(4):
-        from_mean = components.closer(from_mean, targets_of(person.views, frames, 64))
+        from_mean = components.gauss_newton_step(from_mean, targets_of(person.views, frames, 64))
     assert (components.coefficients(from_mean) - wanted).norm() > 100
     assert (components.coefficients(components.start(person.views, frames)) - wanted).norm() < 10
 
@@ -181,7 +181,7 @@ def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice()
     mean_human = components.payload(components.coefficients(everyone))
     view = LinearisedView.of(targets[0], mean_human, InverseSettings())
     wanted = -OBSERVATIONS / PIXEL_STD**2 * float((view.weight * view.residual**2).sum()) / 2
-    assert components.closer(everyone, targets).evidence == pytest.approx(wanted, rel=1e-3)
+    assert components.gauss_newton_step(everyone, targets).evidence == pytest.approx(wanted, rel=1e-3)
 
 
 def test_kinds_within_people_explain_pictures_as_their_gaussian_does():
@@ -231,25 +231,25 @@ def test_the_voxels_follow_the_given_view_beyond_the_linear_fit(monkeypatch):
     assert bool((found.density < linear.density).any())
 
 
-def test_a_seed_draws_the_rest_too(plain, monkeypatch):
+def test_a_seed_draws_the_residual_too(plain, monkeypatch):
     monkeypatch.setattr(from_captures, "descend", lambda start, *_: start)
     behind = frames_of(human_of(COLOURS)).rotation[:, 2, 2] < -0.7
     one, other = (human.payload.density[behind] for human in draw_humans(MODEL, plain[0], (1, 2)))
     assert (one - other).abs().mean() > 0.1  # coefficients are of colours alone
     components = PriorFit.of(MODEL)
-    rest = components.drawn_rest(COLOURS, torch.Generator().manual_seed(0))
-    assert torch.allclose(PRIOR.outside(rest[None])[0], rest, atol=1e-5)
+    residual = components.sample_residual(COLOURS, torch.Generator().manual_seed(0))
+    assert torch.allclose(PRIOR.outside(residual[None])[0], residual, atol=1e-5)
     *_, last = sample(MODEL, [0])
-    assert float(rest.std()) == pytest.approx(float(PRIOR.split(last.x0)[1].std()), rel=0.1)
+    assert float(residual.std()) == pytest.approx(float(PRIOR.split(last.x0)[1].std()), rel=0.1)
 
 
 def test_what_components_cannot_draw_comes_from_the_network():
     model = tiny_model(SLOW)
     with torch.no_grad():
         model.denoiser.local.outer.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 2.0]))
-    rest = PriorFit.of(model).expected_rest(COLOURS)
-    assert torch.allclose(rest[3], torch.tensor(2 * 0.01**0.5), atol=0.01)  # in standard deviations of the rest
-    assert rest[:3].abs().max() < 0.01
+    residual = PriorFit.of(model).mean_residual(COLOURS)
+    assert torch.allclose(residual[3], torch.tensor(2 * 0.01**0.5), atol=0.01)  # in standard deviations of residuals
+    assert residual[:3].abs().max() < 0.01
 
 
 def test_a_model_without_person_components_is_refused():

@@ -23,9 +23,9 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reconstruction import from_pictures
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, deviations, each, outline_error
 from primdiffusion.reconstruction.posture_start import (
-    before_cameras,
     cameras_of,
     framed,
+    place_in_camera,
     read_cameras,
     read_posture,
     repeated,
@@ -243,7 +243,7 @@ def test_a_posture_before_another_camera_looks_the_same():
     posture = a_posture()
     turned = framing(Primitives.place(posture.frames()[0], PAYLOAD), 109, 64, 64)
     other = dataclasses.replace(posture.camera, world_to_camera=turned.world_to_camera[None])
-    moved = before_cameras(posture, other)
+    moved = place_in_camera(posture, other)
     assert torch.allclose(joints_px(moved), joints_px(posture), atol=1e-2)
 
 
@@ -316,7 +316,7 @@ def test_a_person_is_found_from_any_side_in_each_picture(monkeypatch):
     """The last one's outline is that of a front, and its colours those of a back, which decide."""
     model, stage, photographs = reddish_in_front_and_bluish_behind(), Stage(8, 0.03, upright=False), []
     turns, drawn = (8, 98, 262, 188), (8, 98, 262, 8)
-    monkeypatch.setattr(from_pictures, "ROUNDS", [from_pictures.Round(48, stage, steps) for steps in (0, 1, 0)])
+    monkeypatch.setattr(from_pictures, "FIT_STAGES", [from_pictures.FitStage(48, stage, steps) for steps in (0, 1, 0)])
     for turned, true in zip(drawn, turns, strict=True):
         payload = model.decode((1 if turned == true else -1) * model.denoiser.prior.mean)
         pose, betas = standing(60.0, 60.0, turned=turned), torch.zeros(10)
@@ -327,7 +327,7 @@ def test_a_person_is_found_from_any_side_in_each_picture(monkeypatch):
         rgba = torch.cat([encode_srgb(picture.rgb.clamp(0, 1)), picture.alpha[..., None]], -1)
         pixels = (255 * rgba).round().byte().numpy()
         photographs.append(Photograph(Path("a.png"), pixels, Window(0, 0, 96, 96), 96, 96, None))
-    start = from_pictures.start_of(photographs, model)
+    start = from_pictures.initial_pose(photographs, model)
     assert set(start.pictures) == set(range(4))
     monkeypatch.setattr(from_pictures, "outline_error", lambda *_: 1.0)
     found = from_pictures.fit_posture_in(model, photographs, start, lambda: None).posture
@@ -360,7 +360,7 @@ def test_each_arm_may_be_raised_in_a_picture_from_the_side():
         picture = march(Primitives.place(frames, PAYLOAD), framing(Primitives.place(frames, PAYLOAD), 0.0, 96, 96))
     rgba[..., 3] = (255 * picture.alpha).byte()
     photograph = Photograph(Path("a.png"), rgba, Window(0, 0, 96, 96), 96, 96, None)
-    start = from_pictures.start_of([photograph, photograph], MODEL)
+    start = from_pictures.initial_pose([photograph, photograph], MODEL)
     joints = [pose_body(start.posture.betas, pose).joints[:, 1, 3] for pose in each(start.posture.pose)]
     left, right = (torch.stack(joints)[:, JOINT_NAMES.index(f"{side}_wrist")] for side in ("left", "right"))
     assert (left > right + 0.5).any()
