@@ -91,7 +91,9 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
 @pytest.mark.parametrize(
     ("operator", "properties", "sentence"),
     [
-        ("export", {"filepath": "OUT/a.stl"}, "another ending"),
+        ("export", {"filepath": "OUT/a.stl"}, "another ending than .human, .safetensors, .glb, .fbx, .ply"),
+        ("import_human", {"filepath": "OUT"}, "is a folder"),
+        ("import_motion", {"filepath": "OUT"}, "is a folder"),
         ("export", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
         ("set_representation", {"representation": "MESH"}, "no mesh proxy"),
         ("set_representation", {"representation": "NO_MESH"}, "no mesh proxy"),
