@@ -82,7 +82,7 @@ def main() -> None:
     print(f"\n{table(rows)}\n")
     print(f"from pressing the button to a person in the scene: {figures['seconds_pressed_to_standing']:.1f} s")
     print(f"the body follows linear blend skinning within {figures['lbs_error_mm_max']:.5f} mm")
-    print(f"look at {out}: overview.png, contact_sheet.png, human.blend")
+    print(f"look at {out}: overview.png, contact_sheet.png, and with {archive.name} installed, human.blend")
     if arguments.json is not None:
         about = record.surroundings()  # that stage has printed its own figures
         record.write_record(arguments.json, {name: value for name, value in figures.items() if name not in about})

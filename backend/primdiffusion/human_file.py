@@ -105,7 +105,7 @@ def load_human(path: str | Path) -> Human:
     Raises FileNotFoundError, and FileError (a ValueError) for a file that is damaged, newer or of another kind.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
     with as_file_error(path, "is damaged or no safetensors file", "generate the human again", OSError):
         file = tensor_file.TensorFile(path, LARGEST_FILE)

@@ -28,9 +28,11 @@ def error_text(error: BaseException | str) -> str:
 
 
 def sentence(text: BaseException | str) -> str:
-    """`text` with a capital and a full stop; the kind of an error that says nothing."""
+    """`text` with a full stop, and a capital unless a file's name comes first; the kind of an error without words."""
     words = error_text(text) or type(text).__name__
-    words = words[:1].upper() + words[1:]
+    first = words.split(" ")[0][:-1]
+    if not ((isinstance(text, OSError) and text.filename) or any(mark in first for mark in "./\\")):
+        words = words[:1].upper() + words[1:]
     return words if words.endswith((".", "!", "?")) else f"{words}."
 
 

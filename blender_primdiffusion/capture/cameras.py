@@ -164,7 +164,7 @@ def aim_at_picture(camera: bpy.types.Object, view: View) -> None:
 
 
 def stored_turned(path: Path) -> bool:
-    """Whether a picture's EXIF data says that it must be turned or mirrored. Raises OSError."""
+    """Whether a picture's EXIF data says that it must be turned or mirrored. Raises as `check_regular`."""
     check_regular(path)
     file = OpenImageIO.ImageInput.open(str(path))
     if file is None:

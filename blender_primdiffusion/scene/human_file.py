@@ -288,7 +288,7 @@ def read_human(person: Path, remedy: str = GENERATE_AGAIN) -> RestHuman:
     Raises FileNotFoundError where a file is missing, ValueError for a damaged one, a newer one and one on another body,
     OSError.
     """
-    if not person.is_file():
+    if not person.exists():
         raise FileNotFoundError(f"there is no human file at {str(person)!r}; generate the human again")
     tensors = read_tensors(person, remedy)
     payload = payload_in(tensors, person.name, remedy)

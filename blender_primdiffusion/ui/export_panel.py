@@ -145,10 +145,10 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
             layout.prop(settings, name)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        ending = Path(self.filepath).suffix.lower()
-        by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
-        kind = by_ending or context.scene.primdiffusion_export.format
-        path = destination(self.filepath, ENDINGS[kind])
+        kinds = {ending: kind for kind, endings in ENDINGS.items() for ending in endings}
+        chosen = context.scene.primdiffusion_export.format
+        path = destination(self.filepath, sorted(kinds, key=lambda ending: kinds[ending] != chosen))
+        kind = kinds[path.suffix.lower()]
         if kind == "HUMAN":
             write_human(person, path)
             self.report({"INFO"}, f"Exported {person.name} to {path.name}.")
@@ -203,7 +203,7 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> set[str]:
         path = Path(bpy.path.abspath(self.filepath))
-        if not self.filepath or not path.is_file():
+        if not self.filepath or not path.exists():
             raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
         if context.mode.startswith(("EDIT", "PARTICLE")):
             bpy.ops.object.mode_set(mode="OBJECT")
@@ -245,9 +245,6 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH")
     try:
         person = selected_person(context)
-    except ValueError:
-        return
-    try:
         proxy = proxy_of(person)
         outdated = proxy is not None and is_outdated(person, proxy)
     except ValueError:

@@ -74,7 +74,6 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
 def known() -> Vocabulary:
     """The vocabulary of the current checkpoint; empty where it cannot be read, which generating reports."""
-
     chosen, bundled = preference("checkpoint"), backend_module_path()
     if chosen:
         if not is_local_path(chosen):
@@ -132,10 +131,12 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     hair: _menu_property("hair")
     hat: _menu_property("hat")
     use_height: bpy.props.BoolProperty(name="Use Height", description="Generate a body of this height")
-    height: bpy.props.FloatProperty(name="Height (m)", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
+    height: bpy.props.FloatProperty(
+        name="Height (m)", description="Metres; no effect without Use Height", default=1.7, min=0.5, max=2.5, step=1
+    )
     use_weight: bpy.props.BoolProperty(name="Use Weight", description="Generate a body of this weight")
     weight: bpy.props.FloatProperty(
-        name="Weight (kg)", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100
+        name="Weight (kg)", description="Kilograms; no effect without Use Weight", default=70, min=10, max=300, step=100
     )
 
 

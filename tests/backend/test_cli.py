@@ -171,6 +171,12 @@ def test_a_picture_that_cannot_be_written_is_named_and_nothing_is(person, tmp_pa
     assert [path.name for path in tmp_path.rglob("*")] == ["folder.png"]
 
 
+def test_a_folder_in_place_of_a_file_is_named_as_one(person, tmp_path, fails):
+    human, out = person / "person.human.safetensors", tmp_path / "x.png"
+    for line in (("render", tmp_path), ("render", human, "--pose", tmp_path), ("reconstruct", tmp_path)):
+        assert f"{tmp_path} is a folder: give the file in it" in fails(*line, "--out", out).err
+
+
 def test_a_human_is_not_overwritten_by_its_picture(person, fails):
     human = person / "person.human.safetensors"
     before = human.read_bytes()

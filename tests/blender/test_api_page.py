@@ -20,15 +20,6 @@ def test_the_page_is_what_its_script_writes_now(addon):
     assert current, "docs/manual/api.md is out of date: run `python scripts/operators_page`"
 
 
-def test_every_operator_and_setting_has_its_place(addon):
-    text = page.page()
-    for operator in page.operators():
-        assert f"\n### {operator.bl_idname.partition('.')[2]}\n" in text
-    assert "`bpy.context.scene.primdiffusion`" in text
-    assert "| `seed` | int, -1 or more | `-1` |" in text
-    assert "### apply_result" not in text
-
-
 def test_the_page_states_when_an_operator_is_disabled(addon):
     vary = page.page().split("\n### vary\n")[1].split("\n### ")[0]
     assert "tooltip says: There is no" in vary

@@ -314,7 +314,7 @@ def read_motion(path: str | Path, person: str = "") -> BodyPose:
     `person` is one of several people in it; by default who is in the most frames.
     Raises FileNotFoundError or FileError.
     """
-    if not Path(path).is_file():
+    if not Path(path).exists():
         raise FileNotFoundError(f"the pose file {path} does not exist: check the path")
     return _as_pose(files.read_motion(path, person=person))
 

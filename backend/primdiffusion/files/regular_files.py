@@ -59,21 +59,21 @@ def real_path(path: str | Path) -> Path:
 def check_regular(path: str | Path) -> os.stat_result:
     """Return the status of a regular file, without opening it.
 
-    Raises FileNotFoundError, IsADirectoryError, and PermissionError for pipes, sockets and devices.
+    Raises FileNotFoundError, FileError for a folder, and PermissionError for pipes, sockets and devices.
     """
     try:
         status = os.stat(path)
     except ValueError as e:  # a null character
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path)[:200].replace("\0", "?")) from e
     if stat.S_ISDIR(status.st_mode):
-        raise IsADirectoryError(errno.EISDIR, "this is a folder, not a file", str(path))
+        raise FileError(path, "is a folder", "give the file in it")
     if not stat.S_ISREG(status.st_mode):
         raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
     return status
 
 
 def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO:
-    """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and FileError.
+    """Open a regular file of at most `limit` bytes for reading, otherwise FileError. Raises as `check_regular`.
 
     A file that states no size is read as empty: those of /proc may be endless.
     """

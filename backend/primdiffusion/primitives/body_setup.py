@@ -110,10 +110,10 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
         try:
             status = check_regular(path)
             digest = _known_sha256(path, status.st_mtime_ns, status.st_size)
-        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        except (FileNotFoundError, NotADirectoryError):
             continue
         except (OSError, FileError) as error:
-            problem = f"cannot be read ({getattr(error, 'strerror', None) or 'it is too large'})"
+            problem = f"cannot be read ({getattr(error, 'strerror', None) or getattr(error, 'reason', '')})"
             continue
         if digest == file.sha256:
             return path

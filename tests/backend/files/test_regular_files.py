@@ -116,11 +116,9 @@ def test_lines_are_added_to_a_regular_file_alone(tmp_path):
     assert (tmp_path / "lines").read_bytes() == b"one\none\n"
     (tmp_path / "link").symlink_to(tmp_path / "lines")
     (tmp_path / "dangling").symlink_to(tmp_path / "new")
-    for name in ("link", "dangling"):
-        with refused(FileError, name):
-            open_to_append(tmp_path / name)
-    with refused(OSError, tmp_path.name):
-        open_to_append(tmp_path)
+    for path in (tmp_path / "link", tmp_path / "dangling", tmp_path):
+        with refused(FileError, path.name):
+            open_to_append(path)
     assert (tmp_path / "lines").read_bytes() == b"one\none\n"
     assert not (tmp_path / "new").exists()
 

@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.geometry.pictures import check_pixels, decoded, opened_picture
 from support.errors import refused
 
@@ -27,8 +28,8 @@ def test_a_picture_that_cannot_be_decoded_is_one_reason(tmp_path, content):
     assert len(str(raised.value)) < 150
 
 
-def test_missing_pictures_and_folders_are_errors_of_the_system(tmp_path):
-    for path, kind in ((tmp_path / "no.png", FileNotFoundError), (tmp_path, IsADirectoryError)):
+def test_missing_pictures_and_folders_are_errors_of_their_own(tmp_path):
+    for path, kind in ((tmp_path / "no.png", FileNotFoundError), (tmp_path, FileError)):
         with pytest.raises(kind), opened_picture(path):
             pass
 

@@ -13,6 +13,12 @@ pytestmark = pytest.mark.any_blender
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202egnp.exe"
 
 
+def test_a_sentence_keeps_the_case_of_a_files_name():
+    for text in ("anna.bvh does not exist: check the path", "anna/walks is a folder", PermissionError(1, "No", "anna")):
+        assert sentence(text).startswith("anna")
+    assert sentence("no room is left") == "No room is left."
+
+
 def test_no_terminal_escape_leaves_in_a_sentence_a_line_or_a_report(capfd):
     for error in (FileNotFoundError(2, "No such file", ESCAPE), ValueError(f"{ESCAPE}\n"), ESCAPE):
         assert sentence(error).isprintable()

@@ -91,7 +91,9 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
 @pytest.mark.parametrize(
     ("operator", "properties", "sentence"),
     [
-        ("export", {"filepath": "OUT/a.stl"}, "another ending"),
+        ("export", {"filepath": "OUT/a.stl"}, "another ending than .human, .safetensors, .glb, .fbx, .ply"),
+        ("import_human", {"filepath": "OUT"}, "is a folder"),
+        ("import_motion", {"filepath": "OUT"}, "is a folder"),
         ("export", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
         ("set_representation", {"representation": "MESH"}, "no mesh proxy"),
         ("set_representation", {"representation": "NO_MESH"}, "no mesh proxy"),
@@ -171,6 +173,7 @@ def test_a_file_is_imported_at_the_cursor_in_edit_mode_too(store):
     person = humans(bpy.context.scene)[0]
     assert person.location.xy[:] == pytest.approx((1.0, 2.0))
     assert person.name == "person"
+    assert bpy.types.PRIMDIFFUSION_FH_human.bl_import_operator == "primdiffusion.import_human"  # of a dropped file
 
 
 class Dialog:
@@ -213,7 +216,3 @@ def test_the_file_browser_opens_with_the_panels_format_and_shows_its_settings(an
     assert dialog.layout.of("prop") == ["format", "texture_px", "triangles", "animation"]
     assert dialog.filepath == "Anna.fbx"
     window_manager.fileselect_add.assert_called_once()
-
-
-def test_files_can_be_dropped(store):
-    assert bpy.types.PRIMDIFFUSION_FH_human.bl_import_operator == "primdiffusion.import_human"

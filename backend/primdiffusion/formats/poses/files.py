@@ -89,8 +89,10 @@ def read_motion(path: str | Path, up: str = "", person: str = "") -> Motion:
     holds objects, NaN or other data, and ValueError for another `up`.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise FileError(path, "does not exist", "check the path")
+    if path.is_dir():
+        raise FileError(path, "is a folder", "give the file in it")
     if up not in UP_AXES:
         raise ValueError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
     suffix = path.suffix.lower()
