@@ -34,12 +34,12 @@ from primdiffusion.people.payloads import (
     voxels_from_payload,
 )
 from primdiffusion.people.person import Person, make_person, recolour
-from primdiffusion.primitives.skirts import box_sizes
 from primdiffusion.people.stored_people import PersonVariants, read_payloads
 from primdiffusion.people.wardrobe import attribute_labels
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.primitives.skirts import box_sizes
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import march
 from torch import Tensor
