@@ -119,12 +119,10 @@ def test_released_compositing_is_that_of_encoded_colours_and_backgrounds(person,
 
 
 def test_info_tells_what_a_file_is(person, checkpoint, capsys, tmp_path):
-    cli.run(["info", str(person / "person.human.safetensors")])
-    assert json.loads(capsys.readouterr().out)["seed"] == 5
-    cli.run(["info", str(checkpoint)])
-    assert json.loads(capsys.readouterr().out)["name"] == "tiny"
-    cli.run(["info", str(save_tiny_encoder(tmp_path / "encoder.safetensors"))])
-    assert json.loads(capsys.readouterr().out)["name"] == "tiny encoder"
+    human, encoder = person / "person.human.safetensors", save_tiny_encoder(tmp_path / "encoder.safetensors")
+    for file, name, value in ((human, "seed", 5), (checkpoint, "name", "tiny"), (encoder, "name", "tiny encoder")):
+        cli.run(["info", str(file)])
+        assert json.loads(capsys.readouterr().out)[name] == value
     cli.run(["info"])
     assert json.loads(capsys.readouterr().out)["device"] in ("cpu", "cuda")
 

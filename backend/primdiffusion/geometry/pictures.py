@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.files.regular_files import FileError, check_regular, open_regular
+from primdiffusion.files.regular_files import FileError, open_regular
 
 MOST_PIXELS = 8192 * 8192
 """Most pixels of a picture: what scans have."""
@@ -46,12 +46,10 @@ def opened_picture(
     `bytes_each` is the number of bytes that the block makes of a pixel, by which large pictures of small files are
     rejected before anything is decoded.
 
-    Raises ValueError with a reason that does not name the file, FileError for a file that is too large, and OSError for
-    one that cannot be opened.
+    Raises ValueError with a reason that does not name the file, FileError for a folder or a file that is too large, and
+    OSError for one that cannot be opened.
     """
     with contextlib.ExitStack() as stack:
-        if isinstance(source, Path):
-            check_regular(source)
         try:
             file = stack.enter_context(open_regular(source, LARGEST_FILE)) if isinstance(source, Path) else source
             size = file.seek(0, os.SEEK_END)
