@@ -1,5 +1,6 @@
 """A run of stage 1: what it leaves, when it stops, what it says of bad input, and how several processes share it."""
 
+import errno
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.runtime.worker_process import LOCK
 from primdiffusion.training import fit as fit_module
+from primdiffusion.training import run_folder
 from primdiffusion.training.fit import MODEL, EncoderTask, fit, run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
 from primdiffusion.training.fit_data import fit_batches
@@ -187,12 +189,13 @@ def test_a_loss_that_is_not_finite_is_named_and_nothing_is_saved(captures, tmp_p
     assert all((tmp_path / "run" / name).read_bytes() == content for name, content in before.items())
 
 
-def test_metrics_that_find_no_room_name_their_file(captures, tmp_path):
-    config = settings(captures, tmp_path / "run")
-    (config.run / METRICS).mkdir(parents=True)
-    with pytest.raises(OSError) as error:
-        Metrics(config.run).append({"step": 1})
-    assert str(config.run / METRICS) in sentence(error.value)
+def test_metrics_that_find_no_room_name_their_file(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(run_folder, "open_to_append", full)
+    with refused(OSError, str(tmp_path / METRICS)):
+        Metrics(tmp_path).append({"step": 1})
 
 
 def test_the_command_says_where_the_encoder_is(captures, tmp_path, capsys):
