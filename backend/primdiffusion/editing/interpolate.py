@@ -118,16 +118,18 @@ def _between(
 ) -> Payload:
     ends = torch.cat([encode_human(model, human) for human in people])
     of_ends = model.read_condition(ends)
-    nearer = None if of_ends is None else of_ends[int(fraction > 0.5)][None]
-    condition = None if of_ends is None or nearer is None else torch.cat([of_ends, nearer])
+    nearer = condition = None
+    if of_ends is not None:
+        nearer = of_ends[int(fraction > 0.5)][None]
+        condition = torch.cat([of_ends, nearer])
 
     def denoise(x: Tensor, t: int) -> Tensor:
         return model.denoise(x, t, None if condition is None else condition[: len(x)])
 
     back = run_sampler(invert_and_sample(denoise, model.schedule, ends, fraction, chain), on_step)
     latent_residual = ends - back[:2]
-    mean_residual = torch.lerp(latent_residual[:1], latent_residual[1:], fraction)
-    between = decode_latents(model, back[2:] + mean_residual, nearer)
+    lost = torch.lerp(latent_residual[:1], latent_residual[1:], fraction)
+    between = decode_latents(model, back[2:] + lost, nearer)
     residuals = [
         difference(human.payload.to("cpu"), decode_latents(model, x0[None]))
         for human, x0 in zip(people, ends, strict=True)

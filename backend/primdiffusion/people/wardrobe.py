@@ -133,7 +133,7 @@ FEMALE_EYEBROWS, MALE_EYEBROWS = (0, 1, 3, 5, 6, 9, 10), (0, 1, 2, 3, 4, 7, 9, 1
 EYES = "eyes/low-poly/low-poly"
 
 HAT_SHARE, BALD_SHARE = 0.08, 0.08
-MOST_UNUSUAL, BETA_DIGITS = 2.0, 6
+LARGEST_DRAWN_BETA, BETA_DIGITS = 2.0, 6
 STATURE: dict[Sex, float] = {"female": -0.6, "male": 0.05}
 STATURE_SPREAD = 0.55
 """The first beta is height, 14 cm per unit around 1.76 m: men are 1.77 +- 0.08 m tall, women 1.68 +- 0.08 m."""
@@ -200,7 +200,7 @@ def choose(seed: int, femininity: Float[np.ndarray, "10"]) -> Choice:
 
 
 def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.ndarray, "10"], Sex]:
-    """Draw betas of N(0, 1) within MOST_UNUSUAL, and the sex that they correspond to.
+    """Draw betas of N(0, 1) within LARGEST_DRAWN_BETA, and the sex that they correspond to.
 
     Bodies are at least half a standard deviation along `femininity` from the midpoint of the sexes, where the clothes
     of neither fit well.
@@ -212,7 +212,7 @@ def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.
     sign = 1.0 if side >= 0 else -1.0
     betas += axis * sign * max(0.0, 0.5 - abs(side))
     sex: Sex = "female" if sign > 0 else "male"
-    betas = np.clip(betas, -MOST_UNUSUAL, MOST_UNUSUAL)
+    betas = np.clip(betas, -LARGEST_DRAWN_BETA, LARGEST_DRAWN_BETA)
     betas[0] = STATURE[sex] + STATURE_SPREAD * betas[0]
     return betas.round(BETA_DIGITS), sex
 

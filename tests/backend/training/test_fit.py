@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -190,10 +191,7 @@ def test_a_loss_that_is_not_finite_is_named_and_nothing_is_saved(captures, tmp_p
 
 
 def test_metrics_that_find_no_room_name_their_file(tmp_path, monkeypatch):
-    def full(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(run_folder, "open_to_append", full)
+    monkeypatch.setattr(run_folder, "open_to_append", Mock(side_effect=OSError(errno.ENOSPC, "no space left")))
     with refused(OSError, str(tmp_path / METRICS)):
         Metrics(tmp_path).append({"step": 1})
 
