@@ -209,8 +209,9 @@ def _capture(
             for obj in scan.objects:
                 mark_parts(obj, scan.joint_of_group)
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
-            views = placed.views or _views_around(scan, settings, poses)
-            joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
+            placing = poses.rotations, poses.translations
+            views = placed.views or settings.rig.views(*bounding_sphere(scan.bounds(*placing)))
+            joints = np.stack([scan.pose(*pose) for pose in zip(*placing, strict=True)])
         theta = poses.axis_angle().reshape(len(poses), 72)
         write_smpl(folder, theta[:, :3], theta[:, 3:], scan.betas, poses.translations)
         write_joints(folder, views, joints, _body_joints(body, scan.betas, poses))
@@ -233,10 +234,6 @@ def _capture(
 def _body_joints(body: Body, betas: NDArray, poses: Motion) -> NDArray[np.float64]:
     """Joints [F, 24, 3] of the fitted body."""
     return joint_positions(poses.rotations, poses.translations, body.rest(betas)[1])
-
-
-def _views_around(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[View]:
-    return settings.rig.views(*bounding_sphere(scan.bounds(poses.rotations, poses.translations)))
 
 
 def _shoot(stage: CaptureScene, settings: CaptureSettings, folder: Path, view: View, where: tuple[int, int]) -> None:

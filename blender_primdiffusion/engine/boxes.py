@@ -134,9 +134,7 @@ def boxes_of(human: PosedHuman) -> Boxes:
     return _rig(session_body(human.file)).place(human, read_sizes(human.file))
 
 
-@functools.lru_cache(maxsize=4)
-def _rig(model: ShapeModel) -> BoxRig:
-    return BoxRig(model)
+_rig = functools.lru_cache(maxsize=4)(BoxRig)
 
 
 def seen_part(humans: Iterable[Boxes], view: PinholeView) -> tuple[float, float, float, float]:

@@ -74,6 +74,7 @@ def _redraw(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> N
 class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     """`scene.primdiffusion_render`."""
 
+    __slots__ = ()
     step: bpy.props.FloatProperty(
         name="Step",
         description="Distance between samples along a ray: smaller is slower and finer",

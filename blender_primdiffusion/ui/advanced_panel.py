@@ -136,6 +136,7 @@ def _unmerge(person: bpy.types.Object) -> None:
 class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
     """`scene.primdiffusion_merging`."""
 
+    __slots__ = ()
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
         description="Voxel size of the merged volume: half the size shows more detail and takes eight times the memory",

@@ -45,6 +45,7 @@ _PASS_ITEMS = [(kind, *_PASS_NAMES[kind], 1 << i) for i, kind in enumerate(PASSE
 class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     """`scene.primdiffusion_captures`."""
 
+    __slots__ = ()
     people: bpy.props.StringProperty(
         name="People", description="Folder of scans or of exported humans (.glb, .fbx, .obj)", subtype="DIR_PATH"
     )

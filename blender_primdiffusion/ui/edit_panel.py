@@ -41,13 +41,10 @@ TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
 PART_ITEMS = [(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)]
 
 
-def _may_be_other(_self: PRIMDIFFUSION_PG_edit, obj: bpy.types.Object) -> bool:
-    return obj in humans(bpy.context.scene)
-
-
 class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     """`scene.primdiffusion_edit`."""
 
+    __slots__ = ()
     kind: bpy.props.EnumProperty(
         name="Edit",
         description="What the panel does to the human",
@@ -80,7 +77,10 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
     other: bpy.props.PointerProperty(
-        name="Other Human", description="The other human", type=bpy.types.Object, poll=_may_be_other
+        name="Other Human",
+        description="The other human",
+        type=bpy.types.Object,
+        poll=lambda _self, obj: obj in humans(bpy.context.scene),
     )
     what: bpy.props.EnumProperty(name="Transfer", description="What the human gets", items=TRANSFER_ITEMS)
     harmonise: declared(TransferRequest, "harmonise")

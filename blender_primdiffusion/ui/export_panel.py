@@ -91,6 +91,7 @@ OPTIONS = {
 class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     """Export settings of a scene."""
 
+    __slots__ = ()
     format: bpy.props.EnumProperty(name="Format", description="What Export writes", items=FORMATS, default="HUMAN")
     animation: bpy.props.BoolProperty(
         name="Animation",

@@ -124,6 +124,7 @@ def _menu_property(name: str):
 class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     """Attributes to generate a human with; none unless chosen."""
 
+    __slots__ = ()
     sex: _menu_property("sex")
     outfit: _menu_property("outfit")
     pattern: _menu_property("pattern")
@@ -227,6 +228,7 @@ SAMPLER_NAMES = {name: label for name, label, _ in SAMPLER_ITEMS}
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     """`scene.primdiffusion`."""
 
+    __slots__ = ()
     seed: declared(GenerateRequest, "seed", default=10)
     keep_seed: bpy.props.BoolProperty(
         name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each human"

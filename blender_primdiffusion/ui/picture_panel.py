@@ -30,6 +30,7 @@ _LOWERED = {"left_shoulder": -1.0, "right_shoulder": 1.0}  # radians about z, fr
 class PRIMDIFFUSION_PG_picture(bpy.types.PropertyGroup):
     """`scene.primdiffusion_picture`."""
 
+    __slots__ = ()
     mask: bpy.props.StringProperty(
         name="Mask",
         description="Picture of the same size, white where the person is; not needed for a picture with alpha",

@@ -93,6 +93,7 @@ def _log_errors(change) -> None:
 class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
+    __slots__ = ()
     betas: bpy.props.FloatVectorProperty(
         name="Shape",
         description="Difference from the mean body, in standard deviations",

@@ -28,6 +28,7 @@ COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in range(4,
 class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     """`scene.primdiffusion_variations`."""
 
+    __slots__ = ()
     count: bpy.props.EnumProperty(
         name="Count", description="How many humans to choose from", items=COUNT_ITEMS, default="8"
     )

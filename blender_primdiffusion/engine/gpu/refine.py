@@ -130,7 +130,8 @@ class GpuRefinement:
         return (1, shown.sample + 1) if shown.sample + 1 < samples else None
 
     def _begin(self, request: MarchRequest, coarseness: int, sample: int) -> ShownMarch:
-        view = jittered(_coarser(request.view, coarseness), sample)
+        size = [-(-side // coarseness) for side in (request.view.width, request.view.height)]
+        view = jittered(request.view.scaled(*size), sample)
         began = self._clock()
         begun = ShownMarch(request, coarseness, sample, request.begin(view, coarseness))
         self._seconds = self._clock() - began
@@ -150,10 +151,6 @@ class GpuRefinement:
             view = pending.request.view
             self._pixel_seconds = self._seconds * pending.coarseness**2 / (view.width * view.height)
         return done
-
-
-def _coarser(view: PinholeView, coarseness: int) -> PinholeView:
-    return view.scaled(-(-view.width // coarseness), -(-view.height // coarseness))
 
 
 def jittered(view: PinholeView, sample: int) -> PinholeView:

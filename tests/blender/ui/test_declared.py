@@ -34,6 +34,16 @@ def test_a_setting_has_the_limits_of_its_request(addon, group, field):
         assert shown.default == pytest.approx(getattr(record, field))
 
 
+def test_a_misspelt_setting_is_an_error(addon):
+    groups = [name for name in dir(bpy.types.Scene) if name.startswith("primdiffusion")]
+    assert {*SETTINGS} < {*groups}
+    for group in groups:
+        settings = getattr(addon.scene, group)
+        if isinstance(settings, bpy.types.PropertyGroup):
+            with pytest.raises(AttributeError, match="atrributes"):
+                settings.atrributes = ""
+
+
 def test_a_choice_and_a_file_are_those_of_the_record(addon):
     shown = addon.scene.primdiffusion_captures.bl_rna.properties
     assert [(item.identifier, item.name) for item in shown["light"].enum_items] == [
