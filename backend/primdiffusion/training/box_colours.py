@@ -58,7 +58,6 @@ class Meeting(NamedTuple):
     def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
         """Share of each surface in a voxel, and the voxel's tone."""
         slopes = torch.linalg.solve(self.normal, self.by_design[..., None])[..., 0].clamp_min(0)
-        slopes = torch.stack([smooth(slope) for slope in slopes.unbind(-1)], dim=-1)
         shares = slopes / slopes.sum(-1, keepdim=True).clamp_min(1e-6)
         along, power = self._products(shares)
         return shares, (along / power).clamp(0, BRIGHTEST)

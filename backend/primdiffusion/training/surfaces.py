@@ -31,7 +31,6 @@ from primdiffusion.primitives.primitives import K, S
 from primdiffusion.primitives.skirts import box_sizes
 from primdiffusion.training.box_colours import (
     CHUNK,
-    COVERED,
     DARKEST,
     PASSES,
     UNEVEN,
@@ -61,6 +60,8 @@ SMALL, UNEVEN_SMALL = 80, 0.03
 """Boxes of a garment without fades, of which others leave little, and the same of it: a shirt below a jacket."""
 UNEVEN_BORDER = 0.12
 """Largest rms difference of voxels where surfaces meet, in boxes that are wholly explained by them."""
+WHOLE = 0.93
+"""Least share of one surface in a box that it covers from border to border: a little of another one is a hem."""
 UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
 LEAST_SHARE = 0.05
@@ -69,6 +70,8 @@ NO_CLOTH, ALL_CLOTH = 0.1, 0.43
 """Shares of a garment between the legs, below which there is none, and above which it hides all else."""
 DENSE = 0.9
 """Quantile of people whose cloth between the legs is less dense."""
+MOST = 0.5
+"""Least share of people who have cloth in a column of voxels between the legs: hems are at many heights."""
 
 
 class _Rows(NamedTuple):
@@ -209,7 +212,6 @@ class _People:
         skin = covered_by(boxes, region_of(("hands",)), beside, ~region_of(("hair",)))
         if skin is None or not (skin & face).any():
             return []
-        of_skin = self.rows(own, skin, read=face, drawn=~face)
         self.skin[own] = boxes[:, skin & face].mean(1)
         whoever, everyone = row, own
         row, own = self.with_all({**attributes, **plain}, hanging=False)
@@ -225,12 +227,13 @@ class _People:
             if self.unevenness(own, part) > (UNEVEN_SMALL if part.sum() < SMALL else UNEVEN_GARMENT):
                 parts = [each for each in parts if each is not part]
         if len(parts) == 1:
-            return [_Surface(whoever, of_skin, natural=True)]
-        meet = ~(skin | torch.stack(parts).any(0) | region_of(("face", "hair", "hands")))
-        everywhere, found = torch.ones_like(skin), []
-        for part, border in zip(parts, self.borders(own, parts, meet, between), strict=True):
+            return [_Surface(whoever, self.rows(everyone, skin, read=face, drawn=~face), natural=True)]
+        borders, everywhere, found = self.borders(own, parts, between), torch.ones_like(skin), []
+        meet = torch.zeros_like(skin).index_fill(0, torch.cat([border.cell for border in borders]), True)
+        for part, border in zip(parts, borders, strict=True):
             bare = part is parts[0]
-            whole = of_skin if bare else self.rows(own, part, read=everywhere, drawn=everywhere)
+            read, drawn = (face, ~face) if bare else (everywhere, everywhere)
+            whole = self.rows(*((everyone, skin & ~meet) if bare else (own, part & ~meet)), read, drawn)
             rows = _Rows(*(torch.cat(pair) for pair in zip(whole, border, strict=True)))
             if bare or (len(patterned) and self.unevenness(patterned, part) < UNEVEN):  # patterned elsewhere
                 found.append(_Surface(whoever, rows, natural=bare))
@@ -260,11 +263,14 @@ class _People:
         return {"face": face, "features": features.clamp(0, 1), "by_skin": by_skin, "skin": skins}
 
     def skirt(self, attributes: Mapping[str, str], sizes: Float[Tensor, "k 3"], surface: int) -> _Skirt:
-        """The boxes that are sized for the outfit's skirt, as dense as on most people: its cloth is at other places on
-        each."""
+        """The boxes that are sized for the outfit's skirt, as dense as on most people down to the hem that most have:
+        the cloth is at other places on each. Below are legs."""
         _, own = self.with_all(attributes)
         between = (sizes != 1).any(1).nonzero()[:, 0]
-        dense = torch.cat([voxels[:, between, :, 3].clamp(0, 1) for voxels in self.voxels(own)]).quantile(DENSE, dim=0)
+        everyone = torch.cat([voxels[:, between, :, 3].clamp(0, 1) for voxels in self.voxels(own)])
+        everyone = everyone.unflatten(2, (S, S**2))  # from the body outwards
+        hung = ((everyone[:, :, S // 2 :].amax(2) > SOLID).float().mean(0) > MOST)[:, None]
+        dense = torch.where(hung, everyone.quantile(DENSE, dim=0), everyone.median(0).values).flatten(1)
         return _Skirt(torch.full_like(between, surface), between, dense, sizes[between])
 
     def unevenness(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> float:
@@ -297,18 +303,18 @@ class _People:
         self,
         own: Int[Tensor, "n"],
         parts: Sequence[Bool[Tensor, "k"]],
-        meet: Bool[Tensor, "k"],
         always: Bool[Tensor, "k"],
-    ) -> Iterator[_Rows]:
+    ) -> list[_Rows]:
         """Voxels of each of these surfaces in the boxes where some meet, if they explain the box on other people too,
         or in any case.
 
         A surface is drawn over those before it, so its share is that of what later ones leave.
         """
-        cells = meet.nonzero()[:, 0]
+        anywhere = ~region_of(("face", "hair", "hands"))
+        cells = anywhere.nonzero()[:, 0]
         number = self.geometry[own].unique(return_inverse=True)[1]
         one, other = (
-            Meeting.of([self.boxes[half][:, part].mean(1) for part in parts], self.voxels(half), meet)
+            Meeting.of([self.boxes[half][:, part].mean(1) for part in parts], self.voxels(half), anywhere)
             for half in (own[number % 2 == 0], own[number % 2 == 1])
         )
         error, spread = ((a + b) / 2 for a, b in zip(one.tested(other), other.tested(one), strict=True))
@@ -316,7 +322,7 @@ class _People:
         both = Meeting(*(a + b for a, b in zip(one, other, strict=True)))
         parts_of, tone = both.fitted()
         weight = both.seen / both.seen.sum(1, keepdim=True).clamp_min(1e-6)
-        explained &= (parts_of * weight[..., None]).sum(1).amax(1) < COVERED
+        explained &= (parts_of * weight[..., None]).sum(1).amax(1) < WHOLE
         explained |= always[cells]
         above = torch.zeros(len(cells), S**3)
         borders = []
@@ -328,7 +334,7 @@ class _People:
             kept = explained & (of_part > LEAST_SHARE).any(1)
             rows = share[kept], tone[kept], torch.zeros_like(kept)[kept], torch.ones_like(kept)[kept]
             borders.append(_Rows(cells[kept], *rows))
-        return reversed(borders)
+        return borders[::-1]
 
     def in_voxels(
         self,
