@@ -9,12 +9,12 @@ from __future__ import annotations
 import functools
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from primdiffusion.body.model import default_body
 from primdiffusion.primitives.anchors import attach, default_anchors
-from primdiffusion.primitives.primitives import Frames
+from primdiffusion.primitives.primitives import Frames, S
 
 HEMS = {"blouse and skirt": -0.53, "blouse and long skirt": -0.75}
 """Heights of the lowest boxes behind a skirt, on the default body, metres."""
@@ -52,6 +52,17 @@ def inside_legs() -> Bool[Tensor, "k"]:
     return facing & (frames.position[:, 1] < WAIST) & (frames.position[:, 1] > min(HEMS.values()))
 
 
+def voxel_heights(boxes: Int[Tensor, "n"], sizes: Float[Tensor, "n 3"]) -> Float[Tensor, "n 512"]:
+    """Heights of the voxels of boxes of these sizes (`delta_scale`) on the default body in the rest pose, metres."""
+    frames, along = _frames(), torch.linspace(-1, 1, S, device=sizes.device)
+    up, half, height = (
+        field.to(sizes.device)[boxes] for field in (frames.rotation[:, 1], frames.half_extent, frames.position[:, 1])
+    )
+    t, b, n = ((up * half * sizes)[..., None] * along).unbind(1)
+    return (height[:, None, None, None] + n[:, :, None, None] + b[:, None, :, None] + t[:, None, None]).flatten(1)
+
+
+@functools.cache
 def _frames() -> Frames:
     """The boxes of the default body in the rest pose."""
     body = default_body()

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -25,19 +25,23 @@ UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
 SURROUNDED = 0.7
 """Share of a box and its neighbours that a garment covers, above which the box is the garment's too."""
+HIDDEN = 0.1, 0.001
+"""Weights of what is seen of a voxel's column, and of its box."""
+RIDGE = 1e-5
 FEWEST_BOXES = 24
 """Fewest boxes of a garment, or of skin: socks and collars are too few to tell from chance."""
 
 
 class Meeting(NamedTuple):
-    """Sums over people of boxes where surfaces meet: voxels, their colours as mixtures of those of Q surfaces."""
+    """Sums over people of voxels where surfaces meet, as mixtures of the colours of Q surfaces.
 
-    normal: Float[Tensor, "q q"]
+    People on whom a voxel is hidden count less."""
+
+    normal: Float[Tensor, "k 512 q q"]
     by_design: Float[Tensor, "k 512 q"]
     total: Float[Tensor, "k 512 3"]
     square: Float[Tensor, "k 512"]
     seen: Float[Tensor, "k 512"]
-    people: Int[Tensor, ""]
 
     @classmethod
     def of(
@@ -46,35 +50,50 @@ class Meeting(NamedTuple):
         people: Iterator[Float[Tensor, "m 1024 512 4"]],
         cells: Bool[Tensor, "k"],
     ) -> Meeting:
-        normal, design = normal_equations(colours, centred=False)
         parts = []
-        for x, voxels in zip(design.split(CHUNK), people, strict=True):
-            rgb = voxels[:, cells, :, :3]
-            by_design = torch.einsum("ncq,nkvc->kvq", x, rgb)
-            parts.append((by_design, rgb.sum(0), rgb.square().sum((0, 3)), seen(voxels[:, cells]).sum(0)))
-        by_design, total, square, weight = (torch.stack(each).sum(0) for each in zip(*parts, strict=True))
-        return cls(normal, by_design, total, square, weight, torch.tensor(len(design)))
+        for x, voxels in zip(torch.stack(list(colours), dim=-1).split(CHUNK), people, strict=True):
+            visible, rgb = seen(voxels[:, cells]), voxels[:, cells, :, :3]
+            normal = torch.einsum("nkv,ncq,ncr->kvqr", visible, x, x)
+            by_design = torch.einsum("nkv,ncq,nkvc->kvq", visible, x, rgb)
+            total = torch.einsum("nkv,nkvc->kvc", visible, rgb)
+            square = torch.einsum("nkv,nkvc->kv", visible, rgb.square())
+            parts.append((normal, by_design, total, square, visible.sum(0)))
+        return cls(*(torch.stack(each).sum(0) for each in zip(*parts, strict=True)))
 
     def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
         """Share of each surface in a voxel, and the voxel's tone."""
-        slopes = torch.linalg.solve(self.normal, self.by_design[..., None])[..., 0].clamp_min(0)
+        normal, by_design = spread(self.normal), spread(self.by_design)
+        ridge = RIDGE * torch.eye(normal.shape[-1])
+        slopes = torch.linalg.solve(normal + ridge, by_design[..., None])[..., 0].clamp_min(0)
         shares = slopes / slopes.sum(-1, keepdim=True).clamp_min(1e-6)
-        along, power = self._products(shares)
-        return shares, (along / power).clamp(0, BRIGHTEST)
+        along, power = _products(by_design, normal, shares)
+        return shares, (along / power.clamp_min(1e-6)).clamp(0, BRIGHTEST)
 
     def tested(self, other: Meeting) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
         """Mean squares over each box of what the fit to others leaves, and of differences between people."""
         shares, tone = other.fitted()
-        along, power = self._products(shares)
+        along, power = _products(self.by_design, self.normal, shares)
         error = self.square - 2 * tone * along + tone.square() * power
-        spread = self.square - self.total.square().sum(-1) / self.people
-        weight = self.seen / (3 * self.people * self.seen.sum(1, keepdim=True).clamp_min(1e-6))
-        return (error * weight).sum(1), (spread * weight).sum(1)
+        differences = self.square - self.total.square().sum(-1) / self.seen.clamp_min(1e-6)
+        weight = 3 * self.seen.sum(1).clamp_min(1e-6)
+        return error.sum(1) / weight, differences.sum(1) / weight
 
-    def _products(self, shares: Float[Tensor, "k 512 q"]) -> tuple[Float[Tensor, "k 512"], Float[Tensor, "k 512"]]:
-        """Products of mixtures with the voxels, and with themselves."""
-        power = torch.einsum("kvq,qr,kvr->kv", shares, self.normal, shares)
-        return (shares * self.by_design).sum(-1), power.clamp_min(1e-6)
+
+def _products(
+    by_design: Float[Tensor, "k 512 q"], normal: Float[Tensor, "k 512 q q"], shares: Float[Tensor, "k 512 q"]
+) -> tuple[Float[Tensor, "k 512"], Float[Tensor, "k 512"]]:
+    """Products of mixtures with the voxels, and with themselves."""
+    return (shares * by_design).sum(-1), torch.einsum("kvq,kvqr,kvr->kv", shares, normal, shares)
+
+
+def spread(sums: Float[Tensor, "k 512 *d"]) -> Float[Tensor, "k 512 *d"]:
+    """Sums over people with a little of those of the voxel's column, from the body outwards, and of its box.
+
+    Voxels that are hidden on nearly everybody, but not on a sample, look like what is above them.
+    """
+    of_column, of_box = HIDDEN
+    column = sums.unflatten(1, (S, S**2)).mean(1, keepdim=True).expand(-1, S, -1, *sums.shape[2:])
+    return sums + of_column * column.flatten(1, 2) + of_box * sums.mean(1, keepdim=True)
 
 
 def mean_colour(voxels: Float[Tensor, "*b v 4"], weight: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 3"]:
@@ -83,11 +102,10 @@ def mean_colour(voxels: Float[Tensor, "*b v 4"], weight: Float[Tensor, "*b v"]) 
     return total / weight.sum(-1, keepdim=True).clamp_min(1e-6)
 
 
-def normal_equations(
-    colours: Sequence[Float[Tensor, "n 3"]], centred: bool = True
-) -> tuple[Float[Tensor, "q q"], Float[Tensor, "n 3 q"]]:
-    """The normal matrix of a regression on colours, with the same slope for red, green and blue, and its design."""
-    design = torch.stack([colour - colour.mean(0) if centred else colour for colour in colours], dim=-1)
+def normal_equations(colours: Sequence[Float[Tensor, "n 3"]]) -> tuple[Float[Tensor, "q q"], Float[Tensor, "n 3 q"]]:
+    """The normal matrix of a regression on differences of colours from their means, with the same slope for red, green
+    and blue, and its design."""
+    design = torch.stack([colour - colour.mean(0) for colour in colours], dim=-1)
     return torch.einsum("ncq,ncr->qr", design, design) + 1e-2 * torch.eye(len(colours)), design
 
 

@@ -28,7 +28,7 @@ from primdiffusion.diffusion.surfaces import (
 )
 from primdiffusion.editing.regions import region_of
 from primdiffusion.primitives.primitives import K, S
-from primdiffusion.primitives.skirts import box_sizes
+from primdiffusion.primitives.skirts import box_sizes, voxel_heights
 from primdiffusion.training.box_colours import (
     CHUNK,
     DARKEST,
@@ -40,6 +40,7 @@ from primdiffusion.training.box_colours import (
     mean_colour,
     normal_equations,
     smooth,
+    spread,
     surrounded,
     tones_of,
     unexplained_share,
@@ -64,14 +65,14 @@ WHOLE = 0.93
 """Least share of one surface in a box that it covers from border to border: a little of another one is a hem."""
 UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
-LEAST_SHARE = 0.05
-"""Least share of a surface in a voxel: less is chance."""
+LEAST_SHARE = 0.02
+"""Least share of a surface in what is seen of a box: less is chance."""
 NO_CLOTH, ALL_CLOTH = 0.1, 0.43
 """Shares of a garment between the legs, below which there is none, and above which it hides all else."""
 DENSE = 0.9
 """Quantile of people whose cloth between the legs is less dense."""
-MOST = 0.5
-"""Least share of people who have cloth in a column of voxels between the legs: hems are at many heights."""
+BELOW_HEM, LONGER = 0.02, 0.3
+"""Share of a skirt's voxels between the legs that are below its hem by chance, and of skirts that are longer."""
 
 
 class _Rows(NamedTuple):
@@ -263,14 +264,15 @@ class _People:
         return {"face": face, "features": features.clamp(0, 1), "by_skin": by_skin, "skin": skins}
 
     def skirt(self, attributes: Mapping[str, str], sizes: Float[Tensor, "k 3"], surface: int) -> _Skirt:
-        """The boxes that are sized for the outfit's skirt, as dense as on most people down to the hem that most have:
-        the cloth is at other places on each. Below are legs."""
+        """The boxes that are sized for the outfit's skirt, as dense as on most people: its cloth is at other places
+        on each. Hems are at many heights; below that of the longer ones, boxes are as dense as on the middle person."""
         _, own = self.with_all(attributes)
         between = (sizes != 1).any(1).nonzero()[:, 0]
         everyone = torch.cat([voxels[:, between, :, 3].clamp(0, 1) for voxels in self.voxels(own)])
-        everyone = everyone.unflatten(2, (S, S**2))  # from the body outwards
-        hung = ((everyone[:, :, S // 2 :].amax(2) > SOLID).float().mean(0) > MOST)[:, None]
-        dense = torch.where(hung, everyone.quantile(DENSE, dim=0), everyone.median(0).values).flatten(1)
+        height, away = voxel_heights(between, sizes[between]), torch.arange(S**3) >= S**3 // 2  # from the body
+        cloth = (everyone > SOLID) & away
+        hem = torch.stack([height[one].quantile(BELOW_HEM) for one in cloth if one.any()]).quantile(LONGER)
+        dense = torch.where(height > hem, everyone.quantile(DENSE, dim=0), everyone.median(0).values)
         return _Skirt(torch.full_like(between, surface), between, dense, sizes[between])
 
     def unevenness(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> float:
@@ -292,11 +294,12 @@ class _People:
     ) -> _Rows:
         """A surface in the boxes that it covers; its colour is that of boxes where it is read."""
         colour = self.boxes[own][:, part & read].mean(1)
-        by_colour = sum(
-            torch.einsum("nc,nkvc->kv", some, voxels[:, part, :, :3])
-            for some, voxels in zip(colour.split(CHUNK), self.voxels(own), strict=True)
-        )
-        tones = (by_colour / colour.square().sum()).clamp(0, BRIGHTEST)
+        by_colour, weight = torch.zeros(2, int(part.sum()), S**3)
+        for some, voxels in zip(colour.split(CHUNK), self.voxels(own), strict=True):
+            visible = seen(voxels[:, part])
+            by_colour += torch.einsum("nkv,nc,nkvc->kv", visible, some, voxels[:, part, :, :3])
+            weight += torch.einsum("nkv,n->kv", visible, some.square().sum(1))
+        tones = (spread(by_colour) / spread(weight).clamp_min(1e-6)).clamp(0, BRIGHTEST)
         return _Rows(part.nonzero()[:, 0], torch.ones_like(tones), tones, read[part], drawn[part])
 
     def borders(
@@ -317,21 +320,22 @@ class _People:
             Meeting.of([self.boxes[half][:, part].mean(1) for part in parts], self.voxels(half), anywhere)
             for half in (own[number % 2 == 0], own[number % 2 == 1])
         )
-        error, spread = ((a + b) / 2 for a, b in zip(one.tested(other), other.tested(one), strict=True))
-        explained = (error < UNEXPLAINED * spread) & (error.sqrt() < UNEVEN_BORDER)
+        error, differences = ((a + b) / 2 for a, b in zip(one.tested(other), other.tested(one), strict=True))
+        explained = (error < UNEXPLAINED * differences) & (error.sqrt() < UNEVEN_BORDER)
         both = Meeting(*(a + b for a, b in zip(one, other, strict=True)))
         parts_of, tone = both.fitted()
-        weight = both.seen / both.seen.sum(1, keepdim=True).clamp_min(1e-6)
-        explained &= (parts_of * weight[..., None]).sum(1).amax(1) < WHOLE
-        explained |= always[cells]
+        of_boxes = (parts_of * both.seen[..., None]).sum(1) / both.seen.sum(1).clamp_min(1e-6)[:, None]
+        explained = (explained & (of_boxes.amax(1) < WHOLE)) | always[cells]
+        parts_of *= (of_boxes > LEAST_SHARE)[:, None]
+        parts_of /= parts_of.sum(-1, keepdim=True).clamp_min(1e-6)
         above = torch.zeros(len(cells), S**3)
         borders = []
-        for of_part in reversed(parts_of.unbind(-1)):
+        for of_part, of_box in zip(reversed(parts_of.unbind(-1)), reversed(of_boxes.unbind(-1)), strict=True):
             share = (of_part / (1 - above).clamp_min(1e-6)).clamp(0, 1)
             above += of_part
             cloth = ((share - NO_CLOTH) / (ALL_CLOTH - NO_CLOTH)).clamp(0, 1)
             share = torch.where(always[cells][:, None], cloth, share)
-            kept = explained & (of_part > LEAST_SHARE).any(1)
+            kept = explained & (of_box > LEAST_SHARE)
             rows = share[kept], tone[kept], torch.zeros_like(kept)[kept], torch.ones_like(kept)[kept]
             borders.append(_Rows(cells[kept], *rows))
         return borders[::-1]

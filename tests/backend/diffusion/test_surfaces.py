@@ -12,7 +12,7 @@ from primdiffusion.diffusion.model import check_surfaces
 from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, LARGEST, Surfaces, voxels_of, without_faces_and_skirts
 from primdiffusion.editing.regions import region_of
 from primdiffusion.primitives.primitives import GRID, K, S
-from primdiffusion.primitives.skirts import box_sizes, inside_legs
+from primdiffusion.primitives.skirts import box_sizes, inside_legs, voxel_heights
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.surfaces import fit_surfaces
@@ -344,28 +344,30 @@ def found_on(codec, outfit, change):
     return fit_surfaces(people, codec, WORDS, PriorConfig())
 
 
-def test_cloth_between_the_legs_hides_them_and_is_as_dense_as_on_most_people(codec):
-    between = (box_sizes("blouse and skirt") != 1).any(1).nonzero()[:, 0]
-    dense = 0.31 + 0.69 * torch.rand(GEOMETRIES, generator=torch.Generator().manual_seed(9))
-    below = between[::2]  # half of the people have cloth there
+def test_cloth_between_the_legs_hides_them_and_is_as_dense_as_on_most_people_down_to_their_hem(codec):
+    sizes = box_sizes("blouse and skirt")
+    between = (sizes != 1).any(1).nonzero()[:, 0]
+    height, away = voxel_heights(between, sizes[between]), torch.arange(S**3) >= S**3 // 2
+    dense = 0.31 + 0.3 * torch.rand(GEOMETRIES, generator=torch.Generator().manual_seed(9))
 
     def hang(voxels, colours, geometry, generator):
         cloth = 0.6 * colours["trousers"] + 0.4 * torch.rand(len(between), 1, 3, generator=generator)
         voxels[between, INNER, :3], voxels[between, OUTER, :3] = colours["skin"], cloth
-        voxels[between, :, 3] = dense[geometry]
-        if geometry % 2:
-            voxels[below, OUTER, 3] = 0
+        ends = -0.45 if geometry else -1.0
+        voxels[between, :, 3] = dense[geometry] * ~(away & (height < ends))
 
     found = found_on(codec, "blouse and skirt", hang)
     each = dense.repeat_interleave(COLOURINGS)
-    wanted = each.quantile(0.9).expand_as(found.dense).clone()
-    wanted[::2, INNER], wanted[::2, OUTER] = each.median(), 0
-    torch.testing.assert_close(found.dense, wanted, atol=0.01, rtol=0)
+    above, below = height.amin(1) > -0.44, away & (height < -0.5)
+    assert above.any()
+    assert below.any()
+    torch.testing.assert_close(found.dense[above], each.quantile(0.9).expand(int(above.sum()), S**3), atol=0.01, rtol=0)
+    assert float(found.dense[below].max()) < 0.2 < float(dense.min())
     hidden = torch.zeros(K, S**3)
     for surface in (~found.natural).nonzero()[:, 0]:
         own = found.surface == surface
         hidden[found.cell[own]] = torch.maximum(hidden[found.cell[own]], found.share[own])
-    assert float(hidden[between][:, OUTER].min()) > 0.95
+    assert float(hidden[between[above]][:, OUTER].min()) > 0.95
 
 
 def test_a_garment_ends_where_a_box_shows_a_little_of_the_skin(codec):
@@ -377,7 +379,7 @@ def test_a_garment_ends_where_a_box_shows_a_little_of_the_skin(codec):
     found = found_on(codec, "tee", bare)
     (tee,) = (s for s in (~found.natural).nonzero()[:, 0] if torch.isin(hem, found.cell[found.surface == s]).all())
     share = found.share[(found.surface == tee) & torch.isin(found.cell, hem)]
-    torch.testing.assert_close(share, UPPER.float().expand_as(share), atol=0.02, rtol=0)
+    torch.testing.assert_close(share[:, OUTER], UPPER[OUTER].float().expand(len(share), -1), atol=0.1, rtol=0)
 
 
 @pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {}])

@@ -1,11 +1,14 @@
 """Boxes that are sized for skirts."""
 
+import dataclasses
+
 import pytest
 import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.people.wardrobe import OUTFITS, WORDS
 from primdiffusion.primitives.anchors import attach, default_anchors
-from primdiffusion.primitives.skirts import HEMS, LARGEST, MARGIN, box_sizes
+from primdiffusion.primitives.from_mesh import voxel_centres
+from primdiffusion.primitives.skirts import HEMS, LARGEST, MARGIN, box_sizes, voxel_heights
 
 
 def test_skirts_of_the_wardrobe_are_known():
@@ -26,6 +29,8 @@ def test_boxes_between_the_legs_reach_to_the_middle(outfit):
     far = sizes.amax(1) < LARGEST
     torch.testing.assert_close(reach[larger & far], MARGIN * x.abs()[larger & far])
     legs = larger.nonzero()[:, 0]
+    centres = voxel_centres(dataclasses.replace(frames, half_extent=frames.half_extent * sizes))[legs, ..., 1]
+    torch.testing.assert_close(voxel_heights(legs, sizes[legs]), torch.from_numpy(centres).flatten(1))
     mirrored = torch.tensor([-1.0, 1, 1]) * frames.position[legs]
     twin = torch.cdist(mirrored, frames.position[legs]).argmin(1)
     torch.testing.assert_close(sizes[legs].amax(1)[twin], sizes[legs].amax(1), atol=0.02, rtol=0)
