@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from primdiffusion.diffusion.codec import window_weight
 from primdiffusion.diffusion.surfaces import BRIGHTEST, seen
 from primdiffusion.primitives.primitives import GRID, S
 
@@ -25,22 +26,22 @@ UNEVEN = 0.04
 """Largest rms difference between a box's colour and its tone of the surface's."""
 SURROUNDED = 0.7
 """Share of a box and its neighbours that a garment covers, above which the box is the garment's too."""
-HIDDEN = 0.1, 0.001
-"""Weights of what is seen of a voxel's column, and of its box."""
+BESIDE = 0.1, 0.001
+"""Weights of a voxel's column, from the body outwards, and of its box in what is known of the voxel."""
 RIDGE = 1e-5
+"""Added to sums of squares of colours, so that equations have a solution in boxes that are empty on everybody."""
 FEWEST_BOXES = 24
 """Fewest boxes of a garment, or of skin: socks and collars are too few to tell from chance."""
 
 
 class Meeting(NamedTuple):
-    """Sums over people of voxels where surfaces meet, as mixtures of the colours of Q surfaces.
-
-    People on whom a voxel is hidden count less."""
+    """Sums over people of voxels where surfaces meet, as mixtures of the colours of Q surfaces; `dense` ones count."""
 
     normal: Float[Tensor, "k 512 q q"]
     by_design: Float[Tensor, "k 512 q"]
     total: Float[Tensor, "k 512 3"]
     square: Float[Tensor, "k 512"]
+    weight: Float[Tensor, "k 512"]
     seen: Float[Tensor, "k 512"]
 
     @classmethod
@@ -52,12 +53,12 @@ class Meeting(NamedTuple):
     ) -> Meeting:
         parts = []
         for x, voxels in zip(torch.stack(list(colours), dim=-1).split(CHUNK), people, strict=True):
-            visible, rgb = seen(voxels[:, cells]), voxels[:, cells, :, :3]
-            normal = torch.einsum("nkv,ncq,ncr->kvqr", visible, x, x)
-            by_design = torch.einsum("nkv,ncq,nkvc->kvq", visible, x, rgb)
-            total = torch.einsum("nkv,nkvc->kvc", visible, rgb)
-            square = torch.einsum("nkv,nkvc->kv", visible, rgb.square())
-            parts.append((normal, by_design, total, square, visible.sum(0)))
+            weight, rgb = dense(voxels[:, cells]), voxels[:, cells, :, :3]
+            normal = torch.einsum("nkv,ncq,ncr->kvqr", weight, x, x)
+            by_design = torch.einsum("nkv,ncq,nkvc->kvq", weight, x, rgb)
+            total = torch.einsum("nkv,nkvc->kvc", weight, rgb)
+            square = torch.einsum("nkv,nkvc->kv", weight, rgb.square())
+            parts.append((normal, by_design, total, square, weight.sum(0), seen(voxels[:, cells]).sum(0)))
         return cls(*(torch.stack(each).sum(0) for each in zip(*parts, strict=True)))
 
     def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:
@@ -74,9 +75,9 @@ class Meeting(NamedTuple):
         shares, tone = other.fitted()
         along, power = _products(self.by_design, self.normal, shares)
         error = self.square - 2 * tone * along + tone.square() * power
-        differences = self.square - self.total.square().sum(-1) / self.seen.clamp_min(1e-6)
-        weight = 3 * self.seen.sum(1).clamp_min(1e-6)
-        return error.sum(1) / weight, differences.sum(1) / weight
+        differences = self.square - self.total.square().sum(-1) / self.weight.clamp_min(1e-6)
+        counted = self.seen / self.weight.clamp_min(1e-6) / (3 * self.seen.sum(1, keepdim=True).clamp_min(1e-6))
+        return (error * counted).sum(1), (differences * counted).sum(1)
 
 
 def _products(
@@ -86,12 +87,15 @@ def _products(
     return (shares * by_design).sum(-1), torch.einsum("kvq,kvqr,kvr->kv", shares, normal, shares)
 
 
-def spread(sums: Float[Tensor, "k 512 *d"]) -> Float[Tensor, "k 512 *d"]:
-    """Sums over people with a little of those of the voxel's column, from the body outwards, and of its box.
+def dense(voxels: Float[Tensor, "*b 512 4"]) -> Float[Tensor, "*b 512"]:
+    """Weight of each voxel among the same of other people: its density, as the marcher's window shows it."""
+    return voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()
 
-    Voxels that are hidden on nearly everybody, but not on a sample, look like what is above them.
-    """
-    of_column, of_box = HIDDEN
+
+def spread(sums: Float[Tensor, "k 512 *d"]) -> Float[Tensor, "k 512 *d"]:
+    """Sums over people with a little of those of the voxel's column and of its box: a voxel that is empty on nearly
+    everybody, but not on a sample, looks like what is beside it."""
+    of_column, of_box = BESIDE
     column = sums.unflatten(1, (S, S**2)).mean(1, keepdim=True).expand(-1, S, -1, *sums.shape[2:])
     return sums + of_column * column.flatten(1, 2) + of_box * sums.mean(1, keepdim=True)
 

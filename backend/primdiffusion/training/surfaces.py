@@ -36,6 +36,7 @@ from primdiffusion.training.box_colours import (
     UNEVEN,
     Meeting,
     covered_by,
+    dense,
     largest_part,
     mean_colour,
     normal_equations,
@@ -296,9 +297,9 @@ class _People:
         colour = self.boxes[own][:, part & read].mean(1)
         by_colour, weight = torch.zeros(2, int(part.sum()), S**3)
         for some, voxels in zip(colour.split(CHUNK), self.voxels(own), strict=True):
-            visible = seen(voxels[:, part])
-            by_colour += torch.einsum("nkv,nc,nkvc->kv", visible, some, voxels[:, part, :, :3])
-            weight += torch.einsum("nkv,n->kv", visible, some.square().sum(1))
+            counted = dense(voxels[:, part])
+            by_colour += torch.einsum("nkv,nc,nkvc->kv", counted, some, voxels[:, part, :, :3])
+            weight += torch.einsum("nkv,n->kv", counted, some.square().sum(1))
         tones = (spread(by_colour) / spread(weight).clamp_min(1e-6)).clamp(0, BRIGHTEST)
         return _Rows(part.nonzero()[:, 0], torch.ones_like(tones), tones, read[part], drawn[part])
 

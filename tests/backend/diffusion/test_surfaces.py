@@ -374,7 +374,7 @@ def test_a_garment_ends_where_a_box_shows_a_little_of_the_skin(codec):
     hem = region_of(("torso",)).nonzero()[1::4, 0]
 
     def bare(voxels, colours, _geometry, _generator):
-        voxels[hem[:, None], ~UPPER] = torch.cat([colours["skin"], torch.tensor([0.02])])
+        voxels[hem[:, None], ~UPPER] = torch.cat([colours["skin"], torch.tensor([0.12])])
 
     found = found_on(codec, "tee", bare)
     (tee,) = (s for s in (~found.natural).nonzero()[:, 0] if torch.isin(hem, found.cell[found.surface == s]).all())
