@@ -188,10 +188,6 @@ def _set_folder(value: object) -> None:
     cells.set_input(modifier, volume_nodes.FOLDER, value)
 
 
-def _set_merged(value: object) -> None:
-    bpy.data.volumes["Anna_merged"].filepath = value
-
-
 def _set_library(value: object) -> None:
     other = Path(bpy.data.filepath).with_name("other.blend")
     with bpy.data.libraries.load(str(other), link=True) as (_, wanted):
@@ -200,16 +196,12 @@ def _set_library(value: object) -> None:
     bpy.data.libraries[0].filepath = value
 
 
-def _set_name(value: object) -> None:
-    person().name = value
-
-
 PROPERTIES: dict[str, Callable[[object], None]] = {
     **{name: _set_custom(name) for name in HOLDERS},
     "volumes.folder": _set_folder,
-    "merged.filepath": _set_merged,
+    "merged.filepath": lambda value: setattr(bpy.data.volumes["Anna_merged"], "filepath", value),
     "library.filepath": _set_library,
-    "armature.name": _set_name,
+    "armature.name": lambda value: setattr(person(), "name", value),
     **{f"{group}.{name}": _set_setting(group, name) for group, names in SETTINGS.items() for name in names},
     **{f"preferences.{name}": _set_preference(name) for name in PREFERENCES},
 }
@@ -252,7 +244,8 @@ def values(name: str, stage: Stage) -> dict[str, object]:
 
 def panels_fault() -> str:
     """Which panel cannot be drawn, or draws what Blender cannot show; empty when all can."""
-    for cls in [*sidebar.panels(), *_menus()]:
+    menus = [cls for cls in bpy.types.Menu.__subclasses__() if cls.__name__.startswith("PRIMDIFFUSION_MT_")]
+    for cls in [*sidebar.panels(), *menus]:
         try:
             shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or cls.__name__ == "PRIMDIFFUSION_PT_captures"
             if not shown:
@@ -264,10 +257,6 @@ def panels_fault() -> str:
             if len(text) > _LONGEST_LABEL or any(0xD800 <= ord(letter) < 0xE000 for letter in text):
                 return f"{cls.__name__} shows {text!r:.80}"
     return ""
-
-
-def _menus() -> list[type]:
-    return [cls for cls in bpy.types.Menu.__subclasses__() if cls.__name__.startswith("PRIMDIFFUSION_MT_")]
 
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
@@ -328,8 +317,8 @@ def attempt(name: str, value: object, stage: Stage, source: Path) -> list[str]:
         panels_fault(),
         edit_fault(stage, source),
         panels_fault(),
+        saving_fault(),
     ]
-    faults.append(saving_fault())
     return [*filter(None, faults), *stage.changed_outside(before)]
 
 

@@ -70,10 +70,6 @@ def weights(folder: Path, **how: bool) -> Path:
     return folder / "weights.pth"
 
 
-def old_weights(folder: Path) -> Path:
-    return weights(folder, _use_new_zipfile_serialization=False)
-
-
 def smpl_npz(folder: Path) -> Path:
     released_files.save_body(folder)  # with the texture coordinates
     arrays = released_files.body_arrays()
@@ -102,11 +98,6 @@ def bvh(folder: Path) -> Path:
     )
 
 
-def amass(folder: Path) -> Path:
-    amass_files.write_amass(folder / "a.npz", frames=4)
-    return folder / "a.npz"
-
-
 def payload(folder: Path) -> Path:
     diffusion_people.write_people(folder, 1, variants=1)
     return next(folder.glob("person_*.npz"))
@@ -122,24 +113,20 @@ def read_picture(path: Path) -> None:
         decoded(opened, "RGB")
 
 
-def glb(folder: Path) -> Path:
-    return capture_scenes.save_person(folder / "person.glb")
-
-
 KINDS = {
     "human": Kind(human, load_human),
     "checkpoint": Kind(lambda folder: save_tiny_checkpoint(folder / "model.safetensors"), load_checkpoint),
     "weights": Kind(weights, read_weights),
-    "old weights": Kind(old_weights, read_weights),
+    "old weights": Kind(lambda folder: weights(folder, _use_new_zipfile_serialization=False), read_weights),
     "SMPL npz": Kind(smpl_npz, read_smpl),
     "SMPL pkl": Kind(lambda folder: released_files.save_body(folder)[0], read_smpl),
     "pose": Kind(pose, read_pose),
     "BVH": Kind(bvh, read_motion),
-    "AMASS": Kind(amass, read_motion),
+    "AMASS": Kind(lambda folder: Path(amass_files.write_amass(folder / "a.npz", frames=4)), read_motion),
     "depth": Kind(depth, read_npy),
     "payload": Kind(payload, read_payloads),
     "picture": Kind(picture, read_picture),
-    "glb": Kind(glb, read_person),
+    "glb": Kind(lambda folder: capture_scenes.save_person(folder / "person.glb"), read_person),
 }
 
 
@@ -153,12 +140,8 @@ class Canary:
 HOSTILE = pickle.dumps(Canary(), 2)
 
 
-def half(content: bytes) -> bytes:
-    return content[: len(content) // 2]
-
-
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
-    "truncated": half,
+    "truncated": lambda content: content[: len(content) // 2],
     "nearly empty": lambda content: content[:3],
     "empty": lambda _: b"",
     "wrong magic": lambda content: b"\x89wrong\r\n" + content[8:],

@@ -46,11 +46,8 @@ def test_colmaps_quaternions_nerfs_matrices_and_opencvs_arrays_are_the_same_came
             to_world = np.array(frame["transform_matrix"])
             in_opengl = np.linalg.inv(to_world) @ [0.3, 0.2, 0.1, 1]
             assert np.allclose(in_opengl[:3] * (1, -1, -1), view.rotation @ [0.3, 0.2, 0.1] + view.translation)
-            assert np.array_equal(arrays["K"][i] @ np.c_[arrays["R"][i], arrays["T"][i]], _projection(view))
-
-
-def _projection(view):
-    return view.intrinsics @ np.c_[view.rotation, view.translation]
+            projection = view.intrinsics @ np.c_[view.rotation, view.translation]
+            assert np.array_equal(arrays["K"][i] @ np.c_[arrays["R"][i], arrays["T"][i]], projection)
 
 
 def test_an_export_leaves_captures_whole_and_a_second_one_leaves_them_as_they_are(exported):
@@ -112,9 +109,8 @@ def test_few_poses_are_chosen_to_differ_and_the_choice_is_the_seeds(tmp_path):
     np.savez(tmp_path / "a.npz", poses=still)
     chosen = choose_poses([read_motion(tmp_path / "a.npz")], 3, seed=0)
     assert torch.equal(chosen.joint_rotation[0], built_in_poses().joint_rotation[0])
-    assert any(
-        torch.allclose(pose, read_motion(tmp_path / "a.npz").joint_rotation[17]) for pose in chosen.joint_rotation
-    )
+    bent = read_motion(tmp_path / "a.npz").joint_rotation[17]
+    assert any(torch.allclose(pose, bent) for pose in chosen.joint_rotation)
     assert torch.equal(chosen.joint_rotation, choose_poses([read_motion(tmp_path / "a.npz")], 3, seed=0).joint_rotation)
 
 

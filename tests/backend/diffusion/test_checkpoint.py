@@ -235,14 +235,10 @@ def test_a_variant_that_stays_as_it_was_is_named():
 
 def test_a_model_without_kinds_reads_nothing():
     x0 = torch.zeros(2, *MODEL.codec.shape)
-    for denoiser in (torch.nn.Identity(), without_kinds()):
+    prior = dataclasses.replace(MODEL.denoiser.prior, kind=torch.zeros(1, 2, 0))
+    for denoiser in (torch.nn.Identity(), PersonDenoiser(None, prior, MODEL.schedule)):
         model = dataclasses.replace(MODEL, denoiser=denoiser)
         assert unfollowed(model, x0, {"sex": "female"}) == [{}, {}]
-
-
-def without_kinds() -> PersonDenoiser:
-    prior = dataclasses.replace(MODEL.denoiser.prior, kind=torch.zeros(1, 2, 0))
-    return PersonDenoiser(None, prior, MODEL.schedule)
 
 
 def drawn(model):

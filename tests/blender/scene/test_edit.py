@@ -222,13 +222,9 @@ def in_edit_mode(context, anna):
     bpy.ops.object.mode_set(mode="EDIT")
 
 
-def with_renamed_bone(_context, anna):
-    anna.data.bones["left_knee"].name = "knee.L"
-
-
 REFUSED = {
     "'Human' is in Edit Mode: leave it": (in_edit_mode, SHAPE),
-    "no bone 'left_knee'": (with_renamed_bone, SHAPE),
+    "no bone 'left_knee'": (lambda _, anna: setattr(anna.data.bones["left_knee"], "name", "knee.L"), SHAPE),
     "a shape is 10 numbers from -5 to 5, not": (lambda *_: None, SHAPE * 4),
     ", not [1.0]": (lambda *_: None, [1.0]),
 }

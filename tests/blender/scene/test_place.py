@@ -1,5 +1,7 @@
 """Where a new human stands: near the 3D cursor, at its height, clear of humans and solid objects."""
 
+from collections.abc import Callable
+
 import bpy
 import pytest
 import synthetic
@@ -49,37 +51,21 @@ def test_the_second_human_stands_beside_the_first_and_clear_of_solid_objects(sav
     assert second.location.x < 0, "the other side is taken"
 
 
-def hidden_in_view_layer(cube):
-    cube.hide_set(True)
-
-
-def hidden_everywhere(cube):
-    cube.hide_viewport = True
-
-
-def drawn_as_wire(cube):
-    cube.display_type = "WIRE"
-
-
-def below_the_feet(cube):
-    cube.location.z = -0.95
-
-
-def above_the_head(cube):
-    cube.location.z = 3.2
-
-
-def out_of_the_way(cube):
-    cube.location.x = 2.5
+CLEAR: dict[str, Callable] = {
+    "hidden in the view layer": lambda cube: cube.hide_set(True),
+    "hidden everywhere": lambda cube: setattr(cube, "hide_viewport", True),
+    "drawn as wire": lambda cube: setattr(cube, "display_type", "WIRE"),
+    "below the feet": lambda cube: setattr(cube.location, "z", -0.95),
+    "above the head": lambda cube: setattr(cube.location, "z", 3.2),
+    "out of the way": lambda cube: setattr(cube.location, "x", 2.5),
+}
 
 
 @pytest.mark.any_blender
-@pytest.mark.parametrize(
-    "change", [hidden_in_view_layer, hidden_everywhere, drawn_as_wire, below_the_feet, above_the_head, out_of_the_way]
-)
+@pytest.mark.parametrize("change", CLEAR)
 def test_a_human_stands_at_the_cursor_where_nothing_is_in_the_way(saved_scene, source, change):
     bpy.ops.mesh.primitive_cube_add(size=2)
-    change(bpy.context.object)
+    CLEAR[change](bpy.context.object)
     assert tuple(standing(source).location) == (0, 0, 0)
 
 
