@@ -33,7 +33,7 @@ DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fit
 LIMITS = (
     "The humans are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "
     "patterns drawn at random: no robes, uniforms, beards, glasses, wheelchairs or children.",
-    "Lapels and frills at the collar are soft, hems of skirts are uneven, and there are few prints.",
+    "Frills at the collar are soft, hems of long skirts are uneven, and there are few prints.",
     "Body shapes are drawn from a Gaussian given the person; they suit the clothes on average only.",
 )
 """Limits of a model trained on such humans; stated on its card."""

@@ -233,6 +233,8 @@ class _People:
         borders, everywhere, found = self.borders(own, parts, between), torch.ones_like(skin), []
         meet = torch.zeros_like(skin).index_fill(0, torch.cat([border.cell for border in borders]), True)
         for part, border in zip(parts, borders, strict=True):
+            if not (part & ~meet).any():  # no box says what its colour is
+                continue
             bare = part is parts[0]
             read, drawn = (face, ~face) if bare else (everywhere, everywhere)
             whole = self.rows(*((everyone, skin & ~meet) if bare else (own, part & ~meet)), read, drawn)
