@@ -54,11 +54,11 @@ class Meeting(NamedTuple):
         parts = []
         for x, voxels in zip(torch.stack(list(colours), dim=-1).split(CHUNK), people, strict=True):
             weight, rgb = dense(voxels[:, cells]), voxels[:, cells, :, :3]
-            normal = torch.einsum("nkv,ncq,ncr->kvqr", weight, x, x)
-            by_design = torch.einsum("nkv,ncq,nkvc->kvq", weight, x, rgb)
-            total = torch.einsum("nkv,nkvc->kvc", weight, rgb)
-            square = torch.einsum("nkv,nkvc->kv", weight, rgb.square())
-            parts.append((normal, by_design, total, square, weight.sum(0), seen(voxels[:, cells]).sum(0)))
+            weighted = weight[..., None] * rgb
+            normal = torch.einsum("nkv,nqr->kvqr", weight, x.mT @ x)
+            by_design = torch.einsum("nkvc,ncq->kvq", weighted, x)
+            square = (weighted * rgb).sum((0, 3))
+            parts.append((normal, by_design, weighted.sum(0), square, weight.sum(0), seen(voxels[:, cells]).sum(0)))
         return cls(*(torch.stack(each).sum(0) for each in zip(*parts, strict=True)))
 
     def fitted(self) -> tuple[Float[Tensor, "k 512 q"], Float[Tensor, "k 512"]]:

@@ -300,7 +300,7 @@ class _People:
         by_colour, weight = torch.zeros(2, int(part.sum()), S**3)
         for some, voxels in zip(colour.split(CHUNK), self.voxels(own), strict=True):
             counted = dense(voxels[:, part])
-            by_colour += torch.einsum("nkv,nc,nkvc->kv", counted, some, voxels[:, part, :, :3])
+            by_colour += torch.einsum("nc,nkvc->kv", some, counted[..., None] * voxels[:, part, :, :3])
             weight += torch.einsum("nkv,n->kv", counted, some.square().sum(1))
         tones = (spread(by_colour) / spread(weight).clamp_min(1e-6)).clamp(0, BRIGHTEST)
         return _Rows(part.nonzero()[:, 0], torch.ones_like(tones), tones, read[part], drawn[part])
