@@ -252,7 +252,11 @@ def voxels_of(cells: Float[Tensor, "*b v"]) -> Float[Tensor, "*b 512 4"]:
 def seen(voxels: Float[Tensor, "*b 512 4"]) -> Float[Tensor, "*b 512"]:
     """Weight of each voxel in the colour of its box: its density, as the marcher's window shows it, as far as denser
     layers do not hide it from outside. Fits leave other colours below a surface."""
-    weight = voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()
-    layers = weight.unflatten(-1, (S, S, S))  # from the body outwards
+    layers = density_weight(voxels).unflatten(-1, (S, S, S))  # from the body outwards
     above = layers.flip(-3).cumsum(-3).flip(-3) - layers
     return (layers * torch.exp(-OPAQUE * above)).flatten(-3)
+
+
+def density_weight(voxels: Float[Tensor, "*b 512 4"]) -> Float[Tensor, "*b 512"]:
+    """Density of each voxel as the marcher's window shows it."""
+    return voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()

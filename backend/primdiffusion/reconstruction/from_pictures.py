@@ -363,7 +363,7 @@ def _body_in(
 
 
 def _area(photograph: Photograph) -> float:
-    """Area of the person, pixels; 1 where nobody is left."""
+    """Area of the person, pixels; at least 1."""
     return max(1.0, photograph.rgba[..., 3].sum(dtype=np.float64) / 255)
 
 

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from primdiffusion.diffusion.codec import window_weight
-from primdiffusion.diffusion.surfaces import BRIGHTEST, seen
+from primdiffusion.diffusion.surfaces import BRIGHTEST, density_weight, seen
 from primdiffusion.primitives.primitives import GRID, S
 
 PASSES = 3
@@ -35,7 +34,7 @@ FEWEST_BOXES = 24
 
 
 class Meeting(NamedTuple):
-    """Sums over people of voxels where surfaces meet, as mixtures of the colours of Q surfaces; `dense` ones count."""
+    """Sums over people of voxels where surfaces meet, as mixtures of the colours of Q surfaces, by their density."""
 
     normal: Float[Tensor, "k 512 q q"]
     by_design: Float[Tensor, "k 512 q"]
@@ -53,7 +52,7 @@ class Meeting(NamedTuple):
     ) -> Meeting:
         parts = []
         for x, voxels in zip(torch.stack(list(colours), dim=-1).split(CHUNK), people, strict=True):
-            weight, rgb = dense(voxels[:, cells]), voxels[:, cells, :, :3]
+            weight, rgb = density_weight(voxels[:, cells]), voxels[:, cells, :, :3]
             weighted = weight[..., None] * rgb
             normal = torch.einsum("nkv,nqr->kvqr", weight, x.mT @ x)
             by_design = torch.einsum("nkvc,ncq->kvq", weighted, x)
@@ -85,11 +84,6 @@ def _products(
 ) -> tuple[Float[Tensor, "k 512"], Float[Tensor, "k 512"]]:
     """Products of mixtures with the voxels, and with themselves."""
     return (shares * by_design).sum(-1), torch.einsum("kvq,kvqr,kvr->kv", shares, normal, shares)
-
-
-def dense(voxels: Float[Tensor, "*b 512 4"]) -> Float[Tensor, "*b 512"]:
-    """Weight of each voxel among the same of other people: its density, as the marcher's window shows it."""
-    return voxels[..., 3].clamp(0, 1) * window_weight()[: S**3].to(voxels.device).square()
 
 
 def spread(sums: Float[Tensor, "k 512 *d"]) -> Float[Tensor, "k 512 *d"]:

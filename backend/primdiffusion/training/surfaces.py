@@ -22,6 +22,7 @@ from primdiffusion.diffusion.surfaces import (
     DIMMEST,
     SURELY,
     Surfaces,
+    density_weight,
     seen,
     voxels_of,
     without_faces_and_skirts,
@@ -36,7 +37,6 @@ from primdiffusion.training.box_colours import (
     UNEVEN,
     Meeting,
     covered_by,
-    dense,
     largest_part,
     mean_colour,
     normal_equations,
@@ -299,7 +299,7 @@ class _People:
         colour = self.boxes[own][:, part & read].mean(1)
         by_colour, weight = torch.zeros(2, int(part.sum()), S**3)
         for some, voxels in zip(colour.split(CHUNK), self.voxels(own), strict=True):
-            counted = dense(voxels[:, part])
+            counted = density_weight(voxels[:, part])
             by_colour += torch.einsum("nc,nkvc->kv", some, counted[..., None] * voxels[:, part, :, :3])
             weight += torch.einsum("nkv,n->kv", counted, some.square().sum(1))
         tones = (spread(by_colour) / spread(weight).clamp_min(1e-6)).clamp(0, BRIGHTEST)

@@ -382,6 +382,27 @@ def test_a_garment_ends_where_a_box_shows_a_little_of_the_skin(codec):
     torch.testing.assert_close(share[:, OUTER], UPPER[OUTER].float().expand(len(share), -1), atol=0.1, rtol=0)
 
 
+def test_empty_voxels_have_the_tone_of_those_below_them(codec):
+    boxes = region_of(("torso",)).nonzero()[1::4, 0]
+
+    def thin(voxels, _colours, geometry, generator):
+        voxels[boxes, OUTER, :3] = torch.rand(len(boxes), 1, 3, generator=generator)
+        voxels[boxes, OUTER, 3] = 0
+
+    found = found_on(codec, "tee", thin)
+    tone = found.tone[torch.isin(found.cell, boxes) & found.read]
+    assert len(tone) == len(boxes)
+    torch.testing.assert_close(tone[:, OUTER], tone[:, INNER].flip(1), atol=0.05, rtol=0)
+
+
+def test_a_garment_that_no_box_shows_alone_is_not_drawn(codec):
+    def bare(voxels, colours, _geometry, _generator):
+        voxels[region_of(TOP).nonzero(), ~UPPER] = torch.cat([colours["skin"], torch.tensor([0.12])])
+
+    found = found_on(codec, "tee", bare)
+    assert all(found.read[found.surface == surface].any() for surface in range(len(found.condition)))
+
+
 @pytest.mark.parametrize("known", [{"hair": "bald", "hat": "none"}, {}])
 def test_people_without_known_surfaces_stay_as_they_are(surfaces, known):
     cells = torch.rand(1, K, VALUES)
