@@ -35,6 +35,8 @@ IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""
 CLEAN_NOISE = 1e-3
 """Noise of coefficients that are read as they are; some directions have no variance of their own."""
+RIDGE = 1e-3
+"""Added to the covariance of functions of coefficients, as a share of their mean variance."""
 TOGETHER, TOGETHER_ON_CUDA = 8, 32
 """Samples whose distances to all kinds are in memory at once; more on CUDA devices, where launches take the time."""
 
@@ -285,6 +287,18 @@ class PersonPrior(PersonComponents):
             weight.sqrt()[:, None] * (centre - mean),
         ]
         return GaussianOfKinds(mean, torch.cat(rows))
+
+    def moved(
+        self, c: Float[Tensor, "r"], slopes: Float[Tensor, "q r"], change: Float[Tensor, "q"]
+    ) -> Float[Tensor, "r"]:
+        """Coefficients whose functions with these slopes differ by `change`, and all else as it goes with that in the
+        Gaussian of c's likeliest kind: c + S H^T (H S H^T)^-1 change."""
+        group, kind = divmod(int(self.kind_shares(c[None]).argmax()), self.head.shape[1])
+        factor = self.gaussian_of(group, int(self.head[group, kind])).factor
+        along = slopes @ factor.T
+        covariance = along @ along.T
+        ridge = RIDGE * covariance.diagonal().mean() * torch.eye(len(covariance)).to(covariance)
+        return c + torch.linalg.solve(covariance + ridge, change) @ along @ factor
 
     def gaussian_of_all(self, directions: int) -> GaussianOfKinds:
         """The mean and the leading directions of the covariance of all people."""

@@ -26,6 +26,8 @@ from primdiffusion.runtime.device import GRID_THREADS, SLAB_THREADS, each_with_f
 
 BETAS = 10
 """Shape coefficients of a sampled body."""
+VISIBLE = 0.01
+"""Smallest difference of encoded colours that counts."""
 LARGEST_ENTRY = 1.01
 """Largest entry of a basis row of length 1 that a file rounds to half precision."""
 
@@ -168,8 +170,29 @@ class DiffusionModel:
         codec, samples = self.codec.codec, x0.reshape(-1, *self.codec.shape)
         if kind is None:
             kind = prior.expected_kind(prior.split(samples)[0])
+        samples = torch.cat([self._with_natural_colours(prior, *each) for each in zip(samples, kind, strict=True)])
         cells = self.surfaces.draw(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
         return payload_from_cells(cells, self.full_density, codec.zone)
+
+    def _with_natural_colours(
+        self, prior: PersonPrior, x0: Float[Tensor, "c h w"], kind: Float[Tensor, "a"]
+    ) -> Float[Tensor, "1 c h w"]:
+        """A sample moved to where its hair and skin have the colours that are drawn, with all that goes with them.
+
+        A Gaussian has hair darker than black, and then foreheads that make up for it by pale spots.
+        """
+        assert self.surfaces is not None
+        assert isinstance(self.codec, CellCodec)
+        coefficients, _ = prior.split(x0[None])
+        with torch.inference_mode(False), torch.enable_grad():
+            change = torch.zeros_like(coefficients, requires_grad=True)
+            cells = self.codec.codec.decode(x0.clone() + prior.picture(change))
+            own, drawn = self.surfaces.natural_colours(cells[0], kind.clone()).flatten(1)
+            wanted = (drawn - own).detach()
+            if not (wanted.abs() > VISIBLE).any():
+                return x0[None]
+            slopes = torch.stack([torch.autograd.grad(value, change, retain_graph=True)[0][0] for value in own])
+        return x0 + prior.picture(prior.moved(coefficients[0], slopes, wanted)[None] - coefficients)
 
     def read_condition(self, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b a"] | None:
         """Probabilities of attributes of clean samples, as a condition, with garments of one colour plain; None for a

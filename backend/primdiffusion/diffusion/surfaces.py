@@ -99,25 +99,17 @@ class Surfaces(TensorRecord):
         drawn_cells = cells.clone()
         for person, its in enumerate(_fitting(kind, self.condition)):
             surfaces = its.nonzero()[:, 0].tolist()
-            covered = cells.new_zeros(cells.shape[1], S**3)
-            colours = {}
-            for surface in reversed(surfaces):
-                own = self.surface == surface
-                colour = self._colour(cells[person], own & self.read, 1 - covered)
-                if self.natural[surface]:
-                    colour = colour.cummin(0).values
-                    if (own & self.read & ~self.drawn).any():  # skin, which is read from the face
-                        colour = torch.maximum(colour, self.skin[1])
-                        drawn_cells[person, self.face, : 3 * S**3] = self._face(cells[person], colour).mT.flatten(1)
-                colours[surface] = colour.clamp_min(BLACK)
-                own &= self.drawn
-                covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
+            colours, covered = self._colours(cells[person], surfaces)
+            colours = {surface: self._possible(surface, colour) for surface, colour in colours.items()}
             for surface in surfaces:
+                if self._is_skin(surface):
+                    face = self._face(cells[person], colours[surface])
+                    drawn_cells[person, self.face, : 3 * S**3] = face.mT.flatten(1)
                 own = (self.surface == surface).nonzero()[:, 0]
                 drawn = self._printed(cells[person], own, (self.garment == surface).nonzero()[:, 0], 1 - covered)
                 if drawn is None:
                     own = own[self.drawn[own]]
-                    drawn = self.tone[own][..., None] * colours[surface]
+                    drawn = self.tone[own][..., None] * colours[surface].clamp_min(BLACK)
                 rgb = voxels_of(drawn_cells[person, self.cell[own]])[..., :3]
                 rgb = torch.lerp(rgb, drawn, self.share[own][..., None])
                 drawn_cells[person, self.cell[own], : 3 * S**3] = rgb.mT.flatten(1)
@@ -128,13 +120,44 @@ class Surfaces(TensorRecord):
             drawn_cells[person, self.between[own], 3 * S**3 :] = shape
         return drawn_cells
 
+    def natural_colours(self, cells: Float[Tensor, "k v"], kind: Float[Tensor, "a"]) -> Float[Tensor, "2 q 3"]:
+        """Colours of the hair and the skin of a person of this kind: as the cells have them, and as they are drawn."""
+        colours, _ = self._colours(cells, _fitting(kind[None], self.condition)[0].nonzero()[:, 0].tolist())
+        pairs = [(colour, self._possible(one, colour)) for one, colour in colours.items() if self.natural[one]]
+        return torch.stack([torch.stack(pair) for pair in pairs], dim=1) if pairs else cells.new_zeros(2, 0, 3)
+
     def hair(self, kind: Float[Tensor, "a"]) -> Float[Tensor, "k 512"]:
-        """Share of hair in each voxel of people of this kind; skin, unlike hair, is not drawn on all its boxes."""
-        skin = torch.zeros_like(self.natural).index_fill(0, self.surface[self.read & ~self.drawn], True)
+        """Share of hair in each voxel of people of this kind."""
+        skin = torch.tensor([self._is_skin(surface) for surface in range(len(self.natural))])
         own = (_fitting(kind[None], self.condition)[0] & self.natural & ~skin)[self.surface]
         hair = self.share.new_zeros(K, S**3)
         hair[self.cell[own]] = self.share[own]
         return hair
+
+    def _is_skin(self, surface: int) -> bool:
+        """Whether a surface is skin, which, unlike hair, is not drawn on all its boxes."""
+        return bool((self.natural[surface] & (self.surface == surface) & self.read & ~self.drawn).any())
+
+    def _colours(
+        self, cells: Float[Tensor, "k v"], surfaces: list[int]
+    ) -> tuple[dict[int, Float[Tensor, "3"]], Float[Tensor, "k 512"]]:
+        """The colours that the cells have of these surfaces, from the uppermost on, and what they cover together."""
+        covered = torch.zeros_like(cells[:, : S**3])
+        colours = {}
+        for surface in reversed(surfaces):
+            own = self.surface == surface
+            colours[surface] = self._colours_of_boxes(cells, own & self.read, 1 - covered).median(0).values
+            own &= self.drawn
+            covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
+        return colours, covered
+
+    def _possible(self, surface: int, colour: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+        """The colour that is drawn for that of the cells."""
+        if self.natural[surface]:
+            colour = colour.cummin(0).values
+            if self._is_skin(surface):
+                return torch.maximum(colour, self.skin[1])
+        return colour.clamp_min(BLACK)
 
     def _face(self, cells: Float[Tensor, "k v"], skin: Float[Tensor, "3"]) -> Float[Tensor, "f 512 3"]:
         """The face's colours: what it has of its own is smaller on skin darker than the mean."""
@@ -194,18 +217,13 @@ class Surfaces(TensorRecord):
         differences = [(each - each.median(0).values).abs().mean(1) for each in boxes]
         return bool(boxes) and all(float(each.quantile(MOST_BOXES)) < EVEN for each in differences)
 
-    def _colour(
-        self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"], bare: Float[Tensor, "k 512"]
-    ) -> Float[Tensor, "3"]:
-        """The median colour of a person's boxes, of voxels that no later surface covers."""
-        return self._colours_of_boxes(cells, rows, bare).median(0).values
-
     def _colours_of_boxes(
         self, cells: Float[Tensor, "k v"], rows: Bool[Tensor, "n"], bare: Float[Tensor, "k 512"]
     ) -> Float[Tensor, "r 3"]:
-        """The surface's colour by each of its boxes that are mostly bare; the mean of all if there are none."""
+        """The surface's colour by each of its boxes that are mostly bare; the mean of all if there are none. Gradients
+        are of colours alone."""
         voxels = voxels_of(cells[self.cell[rows]])
-        whole = (self.share[rows] - SURELY).clamp_min(0) * seen(voxels)
+        whole = (self.share[rows] - SURELY).clamp_min(0) * seen(voxels.detach())
         weight = whole * bare[self.cell[rows]]
         tone = (self.tone[rows] * weight).sum(1, keepdim=True)
         of_boxes = (voxels[..., :3] * weight[..., None]).sum(1) / tone.clamp_min(1e-6)

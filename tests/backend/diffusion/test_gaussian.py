@@ -118,6 +118,18 @@ def test_people_of_a_group_are_one_gaussian_with_their_mean_and_covariance(head)
     assert prior.heads_of(0) == [0, 1]
 
 
+def test_coefficients_move_with_what_is_changed_as_on_people_of_their_kind():
+    prior = prior_of_parts(seed=1)
+    prior = dataclasses.replace(prior, left=prior.left * 0, head_left=prior.head_left * 0)
+    found = prior.gaussian_of(0, int(prior.head[0, 2]))
+    slopes, change = torch.randn(2, len(prior.parity), dtype=F64), torch.tensor([0.3, -0.2], dtype=F64)
+    covariance = (found.factor.T @ found.factor).numpy()
+    wanted = covariance @ slopes.T.numpy() @ np.linalg.solve(slopes.numpy() @ covariance @ slopes.T.numpy(), change)
+    moved = prior.moved(prior.centre[0, 2], slopes, change) - prior.centre[0, 2]
+    assert np.allclose(moved, wanted, rtol=0.02, atol=0.01 * np.abs(wanted).max())
+    assert torch.allclose(slopes @ moved, change, rtol=0.02)
+
+
 def test_all_people_are_one_gaussian(prior):
     single, found = prior.gaussian(), prior.gaussian_of_all(directions=20)
     assert torch.allclose(found.mean, single.centre[0, 0])
