@@ -197,7 +197,7 @@ class Surfaces(TensorRecord):
         slope = by_colour[best] / gram[best, best].clamp_min(1e-6)
         strength = (variance / (gram[best, best] * slope.square().sum()).clamp_min(1e-6)).sqrt()
         colours = mean + strength * (second[best] - average[best])[..., None] * slope
-        return (self.tone[boxes][..., None] * colours).clamp(0, 1)
+        return (self.tone[boxes][..., None] * colours.clamp_min(BLACK)).clamp_max(1)
 
     def _second(self, number: int) -> Float[Tensor, "n 512"]:
         """Share of a print's second colour in all voxels."""

@@ -288,6 +288,10 @@ def test_hair_and_skin_are_never_bluish_and_black_shows_folds(surfaces):
     drawn = voxels_of(surfaces.draw(cells, kind)[0])[..., :3]
     assert float(drawn[region_of(("hair",))][:, FAR_OUT].std(-1).max()) < 0.01
     torch.testing.assert_close(drawn[region_of(("torso",))].mean((0, 1)), torch.full((3,), BLACK), atol=0.02, rtol=0)
+    printed_tee = dressed("bald", colours | {"print": torch.ones(3)}, torch.Generator(), "block")[None]
+    kind = WORDS.encode({"outfit": "tee", "pattern": "patterned", "hair": "bald", "hat": "none"})[None]
+    drawn = voxels_of(surfaces.draw(printed_tee, kind)[0])[..., :3]
+    assert float(drawn[region_of(("torso",)) & ~second_of("block")].min()) > BLACK / 2
 
 
 @pytest.mark.parametrize("brightness", [0.5, 1.5])
