@@ -4,8 +4,8 @@
     primdiffusion train --start-from start.safetensors --data people --run runs/next
 
 People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
-for the closed form alone. The network keeps its weights for what has not changed. With `--surfaces-only` everything
-stays but the surfaces of clothes that these people wear.
+for what people of a kind are like, not for how frequent the kind is. The network keeps its weights for what has not
+changed. With `--surfaces-only` everything stays but the surfaces of clothes that these people wear.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--base", type=Path, help="checkpoint to renew; default: the included one")
     parser.add_argument("--people", type=Path, required=True, help="folder of `primdiffusion payloads`")
-    parser.add_argument("--more", type=Path, help="further people, of an earlier wardrobe")
+    parser.add_argument("--more", type=Path, help="further people, of an earlier wardrobe or of some outfits")
     parser.add_argument("--without", nargs="*", default=["suit"], help="outfits of --more that are left out")
     parser.add_argument(
         "--surfaces-only", action="store_true", help="find the surfaces of the people's outfits and keep all else"

@@ -64,11 +64,13 @@ def fit_mixture(
     vocabulary: AttributeVocabulary,
     config: PriorConfig,
     inside: PersonComponents,
+    counted: int | None = None,
 ) -> dict[str, Tensor]:
     """Kinds, as fields of `PersonPrior`, for all that can be put together of the people's attributes; a single one if
     they have none.
 
-    The leading `clothes` coefficients are those of the clothes, the others the head's.
+    The leading `clothes` coefficients are those of the clothes, the others the head's. Kinds are as frequent as among
+    the first `counted` people (None: all).
     """
     keys = _keys(condition, vocabulary, config)
     groups, heads = keys[:2]
@@ -82,7 +84,7 @@ def fit_mixture(
         "axes": axes[0], "variance": axes[1], "left": axes[2],
         "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
         "shared": skin, "head_shared": skin_of_head.repeat(len(heads.choices), 1, 1),
-        **_kind_fields(effects, c.mean(0), keys, vocabulary),
+        **_kind_fields(effects, c.mean(0), [k._replace(of_person=k.of_person[:counted]) for k in keys], vocabulary),
     }  # fmt: skip
 
 
@@ -232,7 +234,7 @@ def _kinds(group: int, keys: Sequence[Key]) -> list[Kind]:
             for number, choice in enumerate(key.choices)
             if all(choice[mine] == groups.choices[group][theirs] for mine, theirs in both)
         ]
-        shares = [float(counts[number] / counts[fitting].sum()) for number in fitting]
+        shares = [float(counts[number] / counts[fitting].sum().clamp_min(1)) for number in fitting]
         kinds = [
             Kind(kind.share * share, (*kind.choices, number))
             for kind in kinds
@@ -263,5 +265,5 @@ def _kind_fields(
                     if value >= 0:
                         condition[g, m, blocks[name].start + value] = 1.0
     real = log_weight > 0
-    log_weight[real] = (log_weight[real] / log_weight[real].sum()).log()
+    log_weight[~real], log_weight[real] = IMPOSSIBLE, (log_weight[real] / log_weight[real].sum()).log()
     return {"log_weight": log_weight, "head": head, "centre": centre, "kind": condition}

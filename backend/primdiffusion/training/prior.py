@@ -34,8 +34,8 @@ def fit_prior(
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
     the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
-    too small: both are corrected by leaving `config.folds` parts of the geometries out in turn. Mean and rest are those
-    of detailed people. `part` is that of each cell (None: `body_parts`).
+    too small: both are corrected by leaving `config.folds` parts of the geometries out in turn. Mean, rest and how
+    frequent kinds are come from detailed people. `part` is that of each cell (None: `body_parts`).
     """
     part = body_parts() if part is None else part
     detailed = int(people.detailed)
@@ -58,7 +58,7 @@ def fit_prior(
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
     clothes = max(count, len(signs) - 2 * count)  # the others are hands and head; a single part is all
-    kinds = fit_mixture(c, clothes, people.condition, vocabulary, config, inside)
+    kinds = fit_mixture(c, clothes, people.condition, vocabulary, config, inside, detailed)
     components = {field.name: getattr(inside, field.name) for field in dataclasses.fields(inside)}
     return PersonPrior(**components, rest_variance=rest.clamp_min(1e-6), **kinds)
 

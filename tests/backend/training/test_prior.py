@@ -157,6 +157,17 @@ def test_shares_are_those_of_the_people_given_the_sex(mixture):
     assert share == pytest.approx(0.4 * women_with_long_hair * with_boots, rel=1e-4)
 
 
+def test_further_people_do_not_make_their_kind_more_frequent(mixture):
+    further = [{"sex": "male", "outfit": "jeans", "hair": "crew", "shoes": "pumps"}] * 300
+    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in (*PEOPLE, *further)])
+    c = torch.cat([components(), torch.zeros(300, CLOTHES + 2)])
+    both = SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, CONFIG, ONE_EACH, counted=len(PEOPLE)))
+    torch.testing.assert_close(both.log_weight.exp(), mixture.log_weight.exp())
+    unseen = SimpleNamespace(**fit_mixture(c.flip(0), CLOTHES, condition.flip(0), WORDS, CONFIG, ONE_EACH, counted=300))
+    assert unseen.log_weight.exp()[part(unseen, **further[0])] == pytest.approx(1)
+    assert (unseen.log_weight > IMPOSSIBLE / 2).sum() == 1
+
+
 def test_groups_keep_their_own_variance(mixture):
     spread = [
         variances(mixture.axes[group], mixture.variance[group], mixture.left[group])[3]
