@@ -106,7 +106,8 @@ def outfits_of(people: LatentSet, vocabulary: AttributeVocabulary, config: Prior
 
 
 def with_clothes(base: Surfaces, renewed: Surfaces, outfits: Float[Tensor, "o a"]) -> Surfaces:
-    """The surfaces of `base`, but faces and those of these outfits from `renewed`; below hair, hats and shoes."""
+    """The surfaces of `base`, but those of these outfits, below hair, hats and shoes, from `renewed`; faces, which few
+    people would make those of their outfits, only if `base` has none."""
     clothes = picked(renewed, (renewed.condition @ outfits.T > 0).any(1))
     others = picked(base, ~(base.condition @ outfits.T > 0).any(1))
     moved = dataclasses.replace(
@@ -119,7 +120,7 @@ def with_clothes(base: Surfaces, renewed: Surfaces, outfits: Float[Tensor, "o a"
     )
     names = [field.name for field in dataclasses.fields(Surfaces) if field.name not in OF_FACES]
     both = {name: torch.cat([getattr(clothes, name), getattr(moved, name)]) for name in names}
-    faces = renewed if len(renewed.face) else base
+    faces = base if len(base.face) else renewed
     return Surfaces(**both, **{name: getattr(faces, name) for name in OF_FACES})
 
 

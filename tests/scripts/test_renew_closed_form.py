@@ -64,4 +64,9 @@ def test_clothes_of_some_outfits_are_renewed_with_their_prints():
     assert both.surface.tolist() == [0, 1, 2, 3]
     assert both.garment.tolist() == both.box.tolist() == [1, 0, 2]
     assert torch.equal(both.second[both.printed], torch.cat([renewed.second, base.second[1:]]))
+    face = {"face": torch.arange(1), "features": torch.rand(1, 512, 3), "by_skin": torch.rand(1, 512)}
+    of_tees = dataclasses.replace(renewed, **face)
+    assert torch.equal(with_clothes(base, of_tees, tee[None]).features, of_tees.features)  # base has no faces
+    of_all = dataclasses.replace(base, **{name: 0 * values for name, values in face.items()})
+    assert torch.equal(with_clothes(of_all, of_tees, tee[None]).features, of_all.features)
     assert all(torch.equal(getattr(picked(base, base.natural), name), value) for name, value in vars(base).items())
