@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 import torch
 from primdiffusion.diffusion.checkpoint import load_checkpoint, restore_surfaces, save_checkpoint, store_surfaces
-from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, CellCodec, LinearCodec
+from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import check_surfaces
 from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, LARGEST, Surfaces, voxels_of, without_faces_and_skirts
 from primdiffusion.editing.regions import region_of
@@ -517,7 +516,6 @@ def model_with_surfaces():
 
 def test_decoding_recolours_people_who_have_the_surface():
     model, _ = model_with_surfaces()
-    assert isinstance(model.denoiser, PersonDenoiser)
     prior = model.denoiser.prior
     woman, man = (prior.join(c[None], torch.zeros(1, *model.codec.shape)) for c in prior.centre[0])
     plain = dataclasses.replace(model, surfaces=None)
@@ -535,19 +533,15 @@ def test_decoding_recolours_people_who_have_the_surface():
 @pytest.mark.parametrize("brightness", [-0.4, 0.3])
 def test_what_goes_with_hair_goes_with_the_hair_that_is_drawn(brightness):
     model, surfaces = model_with_surfaces()
-    assert isinstance(model.denoiser, PersonDenoiser)
-    assert isinstance(model.codec, CellCodec)
     codec, prior = model.codec.codec, model.denoiser.prior
     woman = prior.kind[0, 0]
 
-    def grey(level):
-        """All boxes alike, as the components have them."""
+    def grey(level):  # all boxes alike, as the components have them
         return prior.join(torch.full((1, 3), float(level)), torch.zeros(1, *model.codec.shape))
 
     darker, lighter = (surfaces.natural_colours(codec.decode(grey(level))[0], woman)[0].mean() for level in (0, 1))
     level, drawn_level = ((colour - darker) / (lighter - darker) for colour in (brightness, max(brightness, BLACK)))
-    drawn = dataclasses.replace(model, surfaces=surfaces).decode(grey(level)[0], kind=woman[None])
-    wanted = dataclasses.replace(model, surfaces=None).decode(grey(drawn_level)[0])
+    drawn, wanted = model.decode(grey(level)[0], woman[None]), model.codec.to_payload(grey(drawn_level)[0], 100.0)
     torch.testing.assert_close(drawn.rgb[:40], wanted.rgb[:40], atol=2e-3, rtol=0)
 
 
