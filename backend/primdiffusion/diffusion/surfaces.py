@@ -102,7 +102,7 @@ class Surfaces(TensorRecord):
             colours, covered = self._colours(cells[person], surfaces)
             colours = {surface: self._possible(surface, colour) for surface, colour in colours.items()}
             for surface in surfaces:
-                if self._is_skin(surface):
+                if self._skin()[surface]:
                     face = self._face(cells[person], colours[surface])
                     drawn_cells[person, self.face, : 3 * S**3] = face.mT.flatten(1)
                 own = (self.surface == surface).nonzero()[:, 0]
@@ -128,15 +128,15 @@ class Surfaces(TensorRecord):
 
     def hair(self, kind: Float[Tensor, "a"]) -> Float[Tensor, "k 512"]:
         """Share of hair in each voxel of people of this kind."""
-        skin = torch.tensor([self._is_skin(surface) for surface in range(len(self.natural))])
-        own = (_fitting(kind[None], self.condition)[0] & self.natural & ~skin)[self.surface]
+        own = (_fitting(kind[None], self.condition)[0] & self.natural & ~self._skin())[self.surface]
         hair = self.share.new_zeros(K, S**3)
         hair[self.cell[own]] = self.share[own]
         return hair
 
-    def _is_skin(self, surface: int) -> bool:
-        """Whether a surface is skin, which, unlike hair, is not drawn on all its boxes."""
-        return bool((self.natural[surface] & (self.surface == surface) & self.read & ~self.drawn).any())
+    def _skin(self) -> Bool[Tensor, "l"]:
+        """Which surfaces are skin, which, unlike hair, is not drawn on all its boxes."""
+        partly = torch.zeros_like(self.natural).index_fill(0, self.surface[self.read & ~self.drawn], True)
+        return self.natural & partly
 
     def _colours(
         self, cells: Float[Tensor, "k v"], surfaces: list[int]
@@ -155,7 +155,7 @@ class Surfaces(TensorRecord):
         """The colour that is drawn for that of the cells."""
         if self.natural[surface]:
             colour = colour.cummin(0).values
-            if self._is_skin(surface):
+            if self._skin()[surface]:
                 return torch.maximum(colour, self.skin[1])
         return colour.clamp_min(BLACK)
 
