@@ -100,7 +100,7 @@ class Surfaces(TensorRecord):
         for person, its in enumerate(_fitting(kind, self.condition)):
             surfaces = its.nonzero()[:, 0].tolist()
             colours, covered = self._colours(cells[person], surfaces)
-            colours = {surface: self._possible(surface, colour) for surface, colour in colours.items()}
+            colours = {surface: self._as_drawn(surface, colour) for surface, colour in colours.items()}
             for surface in surfaces:
                 if self._skin()[surface]:
                     face = self._face(cells[person], colours[surface])
@@ -123,7 +123,7 @@ class Surfaces(TensorRecord):
     def natural_colours(self, cells: Float[Tensor, "k v"], kind: Float[Tensor, "a"]) -> Float[Tensor, "2 q 3"]:
         """Colours of the hair and the skin of a person of this kind: as the cells have them, and as they are drawn."""
         colours, _ = self._colours(cells, _fitting(kind[None], self.condition)[0].nonzero()[:, 0].tolist())
-        pairs = [(colour, self._possible(one, colour)) for one, colour in colours.items() if self.natural[one]]
+        pairs = [(colour, self._as_drawn(one, colour)) for one, colour in colours.items() if self.natural[one]]
         return torch.stack([torch.stack(pair) for pair in pairs], dim=1) if pairs else cells.new_zeros(2, 0, 3)
 
     def hair(self, kind: Float[Tensor, "a"]) -> Float[Tensor, "k 512"]:
@@ -151,7 +151,7 @@ class Surfaces(TensorRecord):
             covered[self.cell[own]] = torch.maximum(covered[self.cell[own]], self.share[own])
         return colours, covered
 
-    def _possible(self, surface: int, colour: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    def _as_drawn(self, surface: int, colour: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
         """The colour that is drawn for that of the cells."""
         if self.natural[surface]:
             colour = colour.cummin(0).values

@@ -543,6 +543,10 @@ def test_what_goes_with_hair_goes_with_the_hair_that_is_drawn(brightness):
     level, drawn_level = ((colour - darker) / (lighter - darker) for colour in (brightness, max(brightness, BLACK)))
     drawn, wanted = model.decode(grey(level)[0], woman[None]), model.codec.to_payload(grey(drawn_level)[0], 100.0)
     torch.testing.assert_close(drawn.rgb[:40], wanted.rgb[:40], atol=2e-3, rtol=0)
+    cells = codec.decode(grey(level))[0].requires_grad_()
+    (slope,) = torch.autograd.grad(surfaces.natural_colours(cells, woman)[0].sum(), cells)
+    assert slope[:, : 3 * S**3].any()
+    assert not slope[:, 3 * S**3 :].any()  # of colours alone
 
 
 def test_surfaces_are_stored_in_bytes(tmp_path):
