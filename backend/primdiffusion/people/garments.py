@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
+from scipy.ndimage import binary_closing, binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
 from primdiffusion.people import colours
 from primdiffusion.people.assets import Assets
@@ -33,6 +33,8 @@ TRIM_DISTANCE = 24.0
 """Lab distance from a piece's main colour beyond which a texel is trim."""
 
 
+TIE_CHROMA = 7.0
+"""Lab chroma of a suit's trim above which it is a tie; shirts are white."""
 MOST_LETTERING = 0.5
 """Share of a piece that lettering and its rim cover at most."""
 RIM = 2
@@ -96,9 +98,15 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
             lab = lab_from_bytes(original[..., :3])
             distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.array([0.8, 1, 1], np.float64), axis=-1)
             other = here & (distance > TRIM_DISTANCE)
-        if kind.trim:
+        if kind.trim and kind.smooth:
+            tie = here & np.asarray(
+                binary_closing(np.hypot(lab[..., 1], lab[..., 2]) > TIE_CHROMA, np.ones((5, 5)), 2), bool
+            )
+            light = np.where(tie, _blurred(light, tie), light)
+            trim |= other & ~tie
+        elif kind.trim:
             trim |= other
-        if kind.smooth:
+        elif kind.smooth:
             near = np.asarray(binary_dilation(other, iterations=RIM), bool)
             lettering = near[seen].mean() < MOST_LETTERING  # and not stripes, whose mean is the shading
             light = np.where(here, _blurred(light, seen & ~near if lettering else seen), light)

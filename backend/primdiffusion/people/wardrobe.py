@@ -64,7 +64,7 @@ UNISEX = (
     Garment("male_casualsuit04", (DENIM, SMOOTHED_TOP)),
     Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
     Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
-    Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
+    Garment("male_elegantsuit01", (Piece("suit", trim=True, smooth=True), Piece("suit"))),
     Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
 )
 """Garments for both sexes, whichever the pack made them for."""
