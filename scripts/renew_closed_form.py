@@ -5,7 +5,8 @@
 
 People whom training with the same `--holdout` and `--seed` holds out are left out. Plain colourings of `--more` count
 for what people of a kind are like, not for how frequent the kind is. The network keeps its weights for what has not
-changed. With `--surfaces-only` everything stays but the surfaces of clothes that these people wear.
+changed. With `--surfaces-only` everything stays but the surfaces of clothes that these people wear, and which colours
+surfaces have.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.surfaces import Surfaces
 from primdiffusion.people.stored_people import PersonFolder
+from primdiffusion.training.colour_pairs import with_colour_pairs
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet, encode_people, split_people, vocabulary_of
 from primdiffusion.training.prior import fit_prior, fit_shapes
@@ -68,14 +70,19 @@ def main() -> None:
         latents = joined(latents, others, torch.tensor(used))
     config = PriorConfig(channels=arguments.channels, axes=arguments.axes)
     surfaces = fit_surfaces(latents, codec, vocabulary, config)
+    generator = torch.Generator().manual_seed(arguments.seed)
+    assert isinstance(base.denoiser, PersonDenoiser)
     if arguments.surfaces_only:
         if base.surfaces is not None and surfaces is not None:
             surfaces = with_clothes(base.surfaces, surfaces, outfits_of(latents, vocabulary, config))
+        if surfaces is not None:
+            surfaces = with_colour_pairs(surfaces, latents, codec, base.denoiser.prior, generator)
         save_checkpoint(arguments.out, dataclasses.replace(base, surfaces=surfaces), str(base.card["schedule"]))
         return
     prior = fit_prior(latents, codec, vocabulary, config)
     shapes = fit_shapes(latents, prior)
-    assert isinstance(base.denoiser, PersonDenoiser)
+    if surfaces is not None:
+        surfaces = with_colour_pairs(surfaces, latents, codec, prior, generator)
     denoiser = with_prior(base.denoiser, prior)
     card = {**base.card, "closed_form_geometries": len(latents.betas), "closed_form_people": len(latents)}
     model = DiffusionModel(
@@ -117,6 +124,7 @@ def with_clothes(base: Surfaces, renewed: Surfaces, outfits: Float[Tensor, "o a"
         skirt=others.skirt + len(clothes.condition),
         printed=others.printed + len(clothes.garment),
         box=others.box + len(clothes.surface),
+        paired=others.paired + len(clothes.condition),
     )
     names = [field.name for field in dataclasses.fields(Surfaces) if field.name not in OF_FACES]
     both = {name: torch.cat([getattr(clothes, name), getattr(moved, name)]) for name in names}
@@ -127,6 +135,7 @@ def with_clothes(base: Surfaces, renewed: Surfaces, outfits: Float[Tensor, "o a"
 def picked(surfaces: Surfaces, which: Bool[Tensor, "l"]) -> Surfaces:
     """Some of the surfaces, with their boxes and prints."""
     rows, prints, skirts = which[surfaces.surface], which[surfaces.garment], which[surfaces.skirt]
+    pairs = which[surfaces.paired]
     printed = prints[surfaces.printed]
     number, row, print_ = (mask.cumsum(0) - 1 for mask in (which, rows, prints))
     return dataclasses.replace(
@@ -141,6 +150,9 @@ def picked(surfaces: Surfaces, which: Bool[Tensor, "l"]) -> Surfaces:
         second=surfaces.second[printed],
         skirt=number[surfaces.skirt[skirts]],
         **{name: getattr(surfaces, name)[skirts] for name in ("between", "dense", "size")},
+        paired=number[surfaces.paired[pairs]],
+        sampled=surfaces.sampled[pairs],
+        worn=surfaces.worn[pairs],
     )
 
 

@@ -147,10 +147,11 @@ def decode_humans(
     seeds: Sequence[int],
     attributes: Attributes = MappingProxyType({}),
 ) -> list[Human]:
-    """Decode denoised samples x0 into humans on the CPU, without provenance or validation."""
+    """Decode denoised samples x0 into humans on the CPU, in colours of people, without provenance or validation."""
     body = default_body() if model.body_setup is None else model.body_setup.body
     wanted = measures_of(attributes)
     people = []
+    x0 = model.with_peoples_colours(x0)
     for sample_of_one, betas in zip(x0, model.betas(x0, seeds), strict=True):
         if wanted != (None, None):
             betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), body, *wanted)

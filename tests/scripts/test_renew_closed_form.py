@@ -49,7 +49,7 @@ def clothes(outfits, cells, printed):
     return Surfaces(
         outfits, flags, torch.arange(count), torch.tensor(cells), torch.rand(count, 512), torch.rand(count, 512),
         flags, flags, torch.tensor(printed), torch.arange(prints), torch.tensor(printed), torch.rand(prints, 512),
-        **without_faces_and_skirts(),
+        **{**without_faces_and_skirts(), "paired": torch.arange(count), "sampled": outfits, "worn": 1 - outfits},
     )  # fmt: skip
 
 
@@ -63,6 +63,8 @@ def test_clothes_of_some_outfits_are_renewed_with_their_prints():
     assert torch.equal(both.tone, torch.cat([renewed.tone[1:], base.tone[1:]]))
     assert both.surface.tolist() == [0, 1, 2, 3]
     assert both.garment.tolist() == both.box.tolist() == [1, 0, 2]
+    assert both.paired.tolist() == [0, 1, 2, 3]
+    assert torch.equal(both.sampled, both.condition)
     assert torch.equal(both.second[both.printed], torch.cat([renewed.second, base.second[1:]]))
     face = {"face": torch.arange(1), "features": torch.rand(1, 512, 3), "by_skin": torch.rand(1, 512)}
     of_tees = dataclasses.replace(renewed, **face)

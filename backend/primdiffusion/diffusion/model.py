@@ -164,30 +164,62 @@ class DiffusionModel:
         Hair, hats, plain garments and skin have one colour each, and skirts are whole (`Surfaces`), as people of
         `kind` have them; None reads it from the samples.
         """
-        prior = getattr(self.denoiser, "prior", None)
-        if self.surfaces is None or not isinstance(self.codec, CellCodec) or not isinstance(prior, PersonPrior):
+        prior = self._prior_of_surfaces()
+        if prior is None:
             return self.codec.to_payload(x0, self.full_density)
+        assert self.surfaces is not None
+        assert isinstance(self.codec, CellCodec)
         codec, samples = self.codec.codec, x0.reshape(-1, *self.codec.shape)
         if kind is None:
             kind = prior.expected_kind(prior.split(samples)[0])
-        samples = torch.cat([self._with_natural_colours(prior, *each) for each in zip(samples, kind, strict=True)])
+        samples = self._recoloured(prior, samples, kind, self.surfaces.natural_colours)
         cells = self.surfaces.draw(codec.decode(samples), kind).view(*x0.shape[:-3], K, VALUES)
         return payload_from_cells(cells, self.full_density, codec.zone)
 
-    def _with_natural_colours(
-        self, prior: PersonPrior, x0: Float[Tensor, "c h w"], kind: Float[Tensor, "a"]
-    ) -> Float[Tensor, "1 c h w"]:
-        """A sample moved to where its hair and skin have the colours that are drawn, with all that goes with them.
+    def with_peoples_colours(self, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Clean samples of the chain, moved to where clothes, hair and skin have colours of people.
+
+        Not for encoded people, who have them.
+        """
+        prior = self._prior_of_surfaces()
+        if prior is None:
+            return x0
+        assert self.surfaces is not None
+        return self._recoloured(prior, x0, prior.expected_kind(prior.split(x0)[0]), self.surfaces.peoples_colours)
+
+    def _prior_of_surfaces(self) -> PersonPrior | None:
+        """The closed form, if it and the codec are those of surfaces."""
+        prior = getattr(self.denoiser, "prior", None)
+        with_surfaces = self.surfaces is not None and isinstance(self.codec, CellCodec)
+        return prior if with_surfaces and isinstance(prior, PersonPrior) else None
+
+    def _recoloured(
+        self,
+        prior: PersonPrior,
+        x0: Float[Tensor, "b c h w"],
+        kind: Float[Tensor, "b a"],
+        colours: Callable[[Tensor, Tensor], Float[Tensor, "2 q 3"]],
+    ) -> Float[Tensor, "b c h w"]:
+        """Samples moved from the first of the colours that surfaces find in their cells to the second, with all that
+        goes with them.
 
         A Gaussian has hair darker than black, and then foreheads that make up for it by pale spots.
         """
-        assert self.surfaces is not None
+        return torch.cat([self._with_colours(prior, *each, colours) for each in zip(x0, kind, strict=True)])
+
+    def _with_colours(
+        self,
+        prior: PersonPrior,
+        x0: Float[Tensor, "c h w"],
+        kind: Float[Tensor, "a"],
+        colours: Callable[[Tensor, Tensor], Float[Tensor, "2 q 3"]],
+    ) -> Float[Tensor, "1 c h w"]:
         assert isinstance(self.codec, CellCodec)
         coefficients, _ = prior.split(x0[None])
         with torch.inference_mode(False), torch.enable_grad():
             change = torch.zeros_like(coefficients, requires_grad=True)
             cells = self.codec.codec.decode(x0.clone() + prior.picture(change))
-            own, drawn = self.surfaces.natural_colours(cells[0], kind.clone()).flatten(1)
+            own, drawn = colours(cells[0], kind.clone()).flatten(1)
             wanted = (drawn - own).detach()
             if not (wanted.abs() > VISIBLE).any():
                 return x0[None]
@@ -336,7 +368,7 @@ def check_surfaces(surfaces: Surfaces, vocabulary: AttributeVocabulary) -> None:
         raise ValueError(f"surfaces are described by {surfaces.condition.shape[1]} values, not {vocabulary.width}")
     kinds, prints, boxes = len(surfaces.condition), len(surfaces.garment), len(surfaces.cell)
     limits = {"surface": kinds, "cell": K, "garment": kinds, "printed": prints, "box": boxes}
-    limits |= {"face": K, "skirt": kinds, "between": K}
+    limits |= {"face": K, "skirt": kinds, "between": K, "paired": kinds}
     for name, count in limits.items():
         numbers = getattr(surfaces, name)
         if bool((numbers < 0).any()) or bool((numbers >= count).any()):

@@ -8,6 +8,9 @@ everybody (`training.surfaces`).
 Person components also mix prints: a shirt between stripes and checks is neither. But a print is at the same place of a
 garment on everybody who has it, in two colours (`training.prints`).
 
+Colours of people are few and strong: blue jeans, white shirts, black hair. Draws of a Gaussian are what lies between
+them: grey, violet, olive. So what is generated gets the colours that people have (`peoples_colours`).
+
 Dark faces would be blotched: what faces differ by is as large as their skin is bright, and in a Gaussian it is as large
 on all. And skirts would be torn: between the legs each person's cloth is at a place of its own, of which boxes show a
 part. But the boxes that are sized for a skirt (`primitives.skirts`) are nearly as dense on everybody who has it.
@@ -33,7 +36,7 @@ BRIGHTEST = 2.0
 LARGEST = {"share": 1.0, "tone": BRIGHTEST, "second": 1.0, "features": 1.0, "by_skin": BRIGHTEST, "dense": 1.0}
 """Fields with a value for each voxel, which are stored in bytes, and their largest values."""
 LARGEST_SIZE = 4.0
-NUMBERS = ("surface", "cell", "garment", "printed", "box", "face", "skirt", "between")
+NUMBERS = ("surface", "cell", "garment", "printed", "box", "face", "skirt", "between", "paired")
 """Fields of whole numbers."""
 BLACK = 0.1
 """sRGB-encoded colour of what is black: folds would not show in less."""
@@ -43,6 +46,8 @@ EVEN, MOST_BOXES = 0.04, 0.75
 """Difference from the garment's colour that so many of its boxes stay below, on plain people."""
 EXPLAINED = 0.5
 """Share of the variance of a garment's colours that its prints explain together, or it has another one."""
+NEAR = 0.03
+"""Distance between colours, of 0 ... 1 each, over which those of people that they become are mixed."""
 OPAQUE = 5.0
 """Optical depth of a layer of full voxels: about 1.3 in each of the four boxes that overlap."""
 
@@ -92,6 +97,12 @@ class Surfaces(TensorRecord):
     """Density of that box, as stored in cells."""
     size: Float[Tensor, "g 3"]
     """Size of that box, as `delta_scale`."""
+    paired: Int[Tensor, "t"]
+    """The surface of a pair of colours."""
+    sampled: Float[Tensor, "t 3"]
+    """Its colour on a draw of the prior."""
+    worn: Float[Tensor, "t 3"]
+    """Its colour on the person whom the optimal transport of draws to people gives to that draw."""
 
     def draw(self, cells: Float[Tensor, "b k v"], kind: Float[Tensor, "b x"]) -> Float[Tensor, "b k v"]:
         """Decoded cells (`LinearCodec.decode`) of people of these kinds, with each of their surfaces in one colour, or
@@ -120,11 +131,27 @@ class Surfaces(TensorRecord):
             drawn_cells[person, self.between[own], 3 * S**3 :] = shape
         return drawn_cells
 
+    def colours(self, cells: Float[Tensor, "k v"], kind: Float[Tensor, "a"]) -> dict[int, Float[Tensor, "3"]]:
+        """The colour of each surface of a person of this kind, as the cells have it."""
+        return self._colours(cells, _fitting(kind[None], self.condition)[0].nonzero()[:, 0].tolist())[0]
+
     def natural_colours(self, cells: Float[Tensor, "k v"], kind: Float[Tensor, "a"]) -> Float[Tensor, "2 q 3"]:
         """Colours of the hair and the skin of a person of this kind: as the cells have them, and as they are drawn."""
-        colours, _ = self._colours(cells, _fitting(kind[None], self.condition)[0].nonzero()[:, 0].tolist())
-        pairs = [(colour, self._as_drawn(one, colour)) for one, colour in colours.items() if self.natural[one]]
+        colours = self.colours(cells, kind).items()
+        pairs = [(colour, self._as_drawn(one, colour)) for one, colour in colours if self.natural[one]]
         return torch.stack([torch.stack(pair) for pair in pairs], dim=1) if pairs else cells.new_zeros(2, 0, 3)
+
+    def peoples_colours(self, cells: Float[Tensor, "k v"], kind: Float[Tensor, "a"]) -> Float[Tensor, "2 q 3"]:
+        """Colours of the surfaces of a person of this kind: as the cells, a draw of the prior, have them, and as people
+        do."""
+        pairs = []
+        for surface, colour in self.colours(cells, kind).items():
+            own = self.paired == surface
+            if own.any():
+                distance = (self.sampled[own] - colour.detach()).square().sum(1)
+                weight = (-distance / (2 * NEAR**2)).softmax(0)
+                pairs.append(torch.stack([colour, weight @ self.worn[own]]))
+        return torch.stack(pairs, dim=1) if pairs else cells.new_zeros(2, 0, 3)
 
     def hair(self, kind: Float[Tensor, "a"]) -> Float[Tensor, "k 512"]:
         """Share of hair in each voxel of people of this kind."""
@@ -232,7 +259,7 @@ class Surfaces(TensorRecord):
 
 
 def without_faces_and_skirts() -> dict[str, Tensor]:
-    """Fields of surfaces that have no faces and no skirts."""
+    """Fields of surfaces that have no faces, no skirts and no pairs of colours."""
     none = torch.zeros(0, dtype=torch.int64)
     voxels = torch.zeros(0, S**3)
     return {
@@ -244,6 +271,9 @@ def without_faces_and_skirts() -> dict[str, Tensor]:
         "between": none,
         "dense": voxels,
         "size": voxels[:, :3],
+        "paired": none,
+        "sampled": voxels[:, :3],
+        "worn": voxels[:, :3],
     }
 
 

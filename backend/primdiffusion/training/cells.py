@@ -24,6 +24,7 @@ from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.people.stored_people import PersonFolder, one_density
 from primdiffusion.runtime.device import has_fast_bfloat16
+from primdiffusion.training.colour_pairs import with_colour_pairs
 from primdiffusion.training.config import NetworkTraining, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
@@ -79,6 +80,8 @@ def prepare(
     prior = fit_prior(latents, codec, vocabulary, config.prior)
     shapes = fit_shapes(latents, prior)
     surfaces = fit_surfaces(latents, codec, vocabulary, config.prior)
+    if surfaces is not None:
+        surfaces = with_colour_pairs(surfaces, latents, codec, prior, generator)
     prepared = Prepared(latents, unseen, codec, prior, shapes, surfaces, vocabulary, people.full_density)
     _save_prepared(path, prepared)
     return prepared

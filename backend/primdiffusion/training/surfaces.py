@@ -66,6 +66,8 @@ WHOLE = 0.93
 """Least share of one surface in a box that it covers from border to border: a little of another one is a hem."""
 UNEXPLAINED = 0.5
 """Largest share of their variance that the surfaces leave."""
+MOST_READ = 48
+"""Boxes, those most alike, that tell the colour of a garment that is not drawn in one: jeans with fades."""
 LEAST_SHARE = 0.02
 """Least share of a surface in what is seen of a box: less is chance."""
 NO_CLOTH, ALL_CLOTH = 0.1, 0.43
@@ -225,12 +227,15 @@ class _People:
                 garment |= surrounded(garment) & left
                 parts.append(garment)
             left &= ~(start if garment is None else start | garment)
+        found, everywhere = [], torch.ones_like(skin)
         for part in parts[1:]:
             if self.unevenness(own, part) > (UNEVEN_SMALL if part.sum() < SMALL else UNEVEN_GARMENT):
                 parts = [each for each in parts if each is not part]
+                alike = self.alike(own, part)
+                found.append(_Surface(whoever, self.rows(own, alike, read=everywhere, drawn=~everywhere)))
         if len(parts) == 1:
-            return [_Surface(whoever, self.rows(everyone, skin, read=face, drawn=~face), natural=True)]
-        borders, everywhere, found = self.borders(own, parts, between), torch.ones_like(skin), []
+            return [*found, _Surface(whoever, self.rows(everyone, skin, read=face, drawn=~face), natural=True)]
+        borders = self.borders(own, parts, between)
         meet = torch.zeros_like(skin).index_fill(0, torch.cat([border.cell for border in borders]), True)
         for part, border in zip(parts, borders, strict=True):
             if not (part & ~meet).any():  # no box says what its colour is
@@ -281,6 +286,11 @@ class _People:
     def unevenness(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> float:
         """Median over its boxes of the rms difference from one colour on these people."""
         return float(tones_of(self.boxes[people], garment)[1][garment].median())
+
+    def alike(self, people: Int[Tensor, "n"], garment: Bool[Tensor, "k"]) -> Bool[Tensor, "k"]:
+        """The boxes of a garment that differ least from one colour on these people."""
+        uneven = tones_of(self.boxes[people], garment)[1].masked_fill(~garment, torch.inf)
+        return garment & (uneven <= uneven.sort().values[:MOST_READ].max())
 
     def prints(self, garment: _Surface) -> list[Print]:
         """Prints on a garment of patterned people."""

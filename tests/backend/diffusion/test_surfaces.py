@@ -12,9 +12,10 @@ from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, LARGEST, Surfaces
 from primdiffusion.editing.regions import region_of
 from primdiffusion.primitives.primitives import GRID, K, S
 from primdiffusion.primitives.skirts import box_sizes, inside_legs, voxel_heights
+from primdiffusion.training.colour_pairs import with_colour_pairs
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
-from primdiffusion.training.surfaces import fit_surfaces
+from primdiffusion.training.surfaces import MOST_READ, fit_surfaces
 from support.errors import refused
 from support.tiny import model_of_two_kinds
 
@@ -201,7 +202,7 @@ def test_shoes_are_found_in_the_voxels_that_they_cover(surfaces):
 
 
 def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
-    garments, (skin,) = rows_of(surfaces, outfit="tee", pattern="plain"), rows_of(surfaces, outfit="tee")
+    garments, (faded, skin) = rows_of(surfaces, outfit="tee", pattern="plain"), rows_of(surfaces, outfit="tee")
     tee = next(each for each in garments if region_of(("torso",))[each.cell].any())
     assert torch.equal(over(tee.read, tee.cell), region_of(TOP))
     tone = over(tee.tone, tee.cell)
@@ -212,6 +213,8 @@ def test_garments_and_skin_are_found_in_the_boxes_that_they_cover(surfaces):
     assert torch.equal(skin.read, region_of(("face",))[skin.cell])
     assert torch.equal(skin.drawn, ~skin.read)
     assert not any(region_of(("thighs",))[each.cell].any() for each in garments)  # fades are no chance
+    assert region_of(("hips", "thighs"))[faded.cell].all()
+    assert (len(faded.cell), faded.read.all(), faded.drawn.any()) == (MOST_READ, True, False)
 
 
 def test_a_suit_of_one_cloth_is_one_surface_with_the_box_of_another_colour_in_its_middle(surfaces):
@@ -225,7 +228,7 @@ def test_a_pattern_on_the_tee_leaves_the_skirt_in_one_colour(surfaces):
 
 
 def test_voxels_where_surfaces_meet_belong_to_each(surfaces):
-    (bare,), (tee,) = rows_of(surfaces, outfit="tee"), rows_of(surfaces, outfit="tee", pattern="plain")
+    (_, bare), (tee,) = rows_of(surfaces, outfit="tee"), rows_of(surfaces, outfit="tee", pattern="plain")
     collar = region_of(COLLAR)
     assert region_of(("face",))[bare.cell[bare.read]].all()
     below, above = (over(part.share * part.drawn[:, None], part.cell) for part in (bare, tee))
@@ -549,11 +552,36 @@ def test_what_goes_with_hair_goes_with_the_hair_that_is_drawn(brightness):
     assert not slope[:, 3 * S**3 :].any()  # of colours alone
 
 
+def test_what_is_generated_has_the_colours_that_people_have_as_often_as_they_have_them():
+    model, surfaces = model_with_surfaces()
+    codec, prior = model.codec.codec, dataclasses.replace(model.denoiser.prior, variance=torch.full((1, 3), 60.0**2))
+    model.denoiser.load_state_dict({"prior_variance": prior.variance}, strict=False)
+    generator = torch.Generator().manual_seed(0)
+
+    def brightness(latents):
+        return torch.stack([surfaces.colours(codec.decode(one[None])[0], prior.kind[0, 0])[0] for one in latents])
+
+    rest = torch.zeros(40, *model.codec.shape)
+    levels = prior.centre[0, 0] + torch.where(torch.arange(40) < 10, 150.0, -150.0)[:, None]
+    people = LatentSet(prior.join(levels, rest).half(), torch.arange(40), torch.zeros(40, 10),
+                       prior.kind[0, :1].expand(40, -1), torch.tensor(40))  # fmt: skip
+    dark, light = brightness(people.latents.float())[[39, 0]]
+    model = dataclasses.replace(model, surfaces=with_colour_pairs(surfaces, people, codec, prior, generator))
+    drawn = torch.cat([prior.sample(1, generator, prior.kind[0, :1]) for _ in range(80)])
+    made = brightness(model.with_peoples_colours(drawn))
+    off = torch.stack([(made - each).abs().amax(1) for each in (dark, light)])
+    assert float(off.amin(0).quantile(0.9)) < 0.1 * float((light - dark).mean())
+    assert float((off[1] < off[0]).float().mean()) == pytest.approx(0.25, abs=0.1)
+    few = dataclasses.replace(people, detailed=torch.tensor(3))
+    assert not len(with_colour_pairs(surfaces, few, codec, prior, generator).paired)
+
+
 def test_surfaces_are_stored_in_bytes(tmp_path):
     model, surfaces = model_with_surfaces()
     face = {"face": torch.arange(2), "features": torch.rand(2, S**3, 3), "by_skin": BRIGHTEST * torch.rand(2, S**3)}
     share = surfaces.share.index_fill(0, torch.tensor([1, 3]), 1.0)
-    surfaces = dataclasses.replace(surfaces, share=share, **face, **skirt_of(dense=0.3, size=1.7))
+    pairs = {"paired": torch.zeros(1, dtype=torch.int64), "sampled": torch.ones(1, 3), "worn": torch.zeros(1, 3)}
+    surfaces = dataclasses.replace(surfaces, share=share, **face, **skirt_of(dense=0.3, size=1.7), **pairs)
     save_checkpoint(tmp_path / "model.safetensors", dataclasses.replace(model, surfaces=surfaces), "linear")
     loaded = load_checkpoint(tmp_path / "model.safetensors").surfaces
     assert loaded is not None
@@ -592,6 +620,8 @@ def test_earlier_checkpoints_have_neither_faces_nor_skirts():
         ({"second": torch.full((2, S**3), 1.5)}, "second"),
         ({"face": torch.zeros(1, dtype=torch.int64)}, "f"),
         ({"skin": -torch.ones(2, 3)}, "skin"),
+        ({"paired": torch.ones(0, dtype=torch.int64), "worn": torch.ones(1, 3)}, "worn"),
+        ({"paired": torch.ones(1, dtype=torch.int64), "worn": torch.ones(1, 3), "sampled": torch.ones(1, 3)}, "paired"),
         (skirt_of(skirt=1), "skirt"),
         (skirt_of(between=K), "between"),
         (skirt_of(dense=1.5), "dense"),
