@@ -104,6 +104,14 @@ class LinearCodec(TensorRecord):
             values[..., members, :] = coefficients[..., members, :] @ basis
         return values.div_(self.weight).add_(self.mean)  # in place: the cells of a person take 8 MB
 
+    def pulled_back(self, slopes: Float[Tensor, "k v"]) -> Float[Tensor, "c 32 32"]:
+        """Slopes on latents of a function that has these slopes on their cells, few of which it depends on."""
+        latents, touched = slopes.new_zeros(K, self.channels), slopes.any(-1)
+        for basis, members in zip(self.basis, self._members(), strict=True):
+            own = members[touched[members]]
+            latents[own] = slopes[own] / self.weight @ basis.T / SLAB_UNIT
+        return latents.T.unflatten(-1, (GRID, GRID))
+
     def voxel_basis(self, channels: int) -> Float[Tensor, "b 512 4 c"]:
         """Change of each voxel's encoded colour and relative density per unit of the leading channels."""
         basis = self.basis[:, :channels] / (self.weight * SLAB_UNIT)

@@ -57,16 +57,16 @@ class PersonComponents(TensorRecord):
     def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
         centred = z - signal * self.mean
-        coefficients = self._along(centred)
+        coefficients = self.along(centred)
         return coefficients, centred - self.picture(coefficients)
 
     def join(self, coefficients: Float[Tensor, "b r"], rest: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Latents of person coefficients and rest; the rest's share along the components is removed."""
-        return self.mean + rest + self.picture(coefficients - self._along(rest))
+        return self.mean + rest + self.picture(coefficients - self.along(rest))
 
     def outside(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The part orthogonal to the person components of latents without the mean."""
-        return z - self.picture(self._along(z))
+        return z - self.picture(self.along(z))
 
     def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
         """Return the contribution of person coefficients to latents, without the mean."""
@@ -77,7 +77,8 @@ class PersonComponents(TensorRecord):
         picture[:, :channels, self._order] = drawn.unflatten(1, (-1, channels)).mT
         return picture.unflatten(2, self.mean.shape[1:])
 
-    def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
+    def along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
+        """Coefficients of latents without the mean."""
         cells = z.flatten(2)[:, : self.basis.shape[2], self._order].mT
         own = cells.split([basis.shape[1] for basis in self.bases()], dim=1)
         return torch.cat(

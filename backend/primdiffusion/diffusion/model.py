@@ -216,14 +216,15 @@ class DiffusionModel:
     ) -> Float[Tensor, "1 c h w"]:
         assert isinstance(self.codec, CellCodec)
         coefficients, _ = prior.split(x0[None])
+        codec = self.codec.codec
         with torch.inference_mode(False), torch.enable_grad():
-            change = torch.zeros_like(coefficients, requires_grad=True)
-            cells = self.codec.codec.decode(x0.clone() + prior.picture(change))
-            own, drawn = colours(cells[0], kind.clone()).flatten(1)
+            cells = codec.decode(x0.clone()).requires_grad_()
+            own, drawn = colours(cells, kind.clone()).flatten(1)
             wanted = (drawn - own).detach()
             if not (wanted.abs() > VISIBLE).any():
                 return x0[None]
-            slopes = torch.stack([torch.autograd.grad(value, change, retain_graph=True)[0][0] for value in own])
+            by_cells = (torch.autograd.grad(value, cells, retain_graph=True)[0] for value in own)
+            slopes = prior.along(torch.stack([codec.pulled_back(each) for each in by_cells]))
         return x0 + prior.picture(prior.moved(coefficients[0], slopes, wanted)[None] - coefficients)
 
     def read_condition(self, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b a"] | None:
