@@ -1,11 +1,12 @@
-"""A small checkpoint, and command lines that fail."""
+"""A small checkpoint, a person of it, and command lines that fail."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from support.tiny import save_tiny_checkpoint
+from primdiffusion.human import Human, generate
+from support.tiny import save_tiny_checkpoint, tiny_model
 
 
 class Failed(NamedTuple):
@@ -20,6 +21,12 @@ class Failed(NamedTuple):
 def checkpoint(tmp_path_factory) -> Path:
     """Of `tiny_model`; not to be changed."""
     return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors")
+
+
+@pytest.fixture(scope="session")
+def human() -> Human:
+    """A person of `tiny_model`; not to be changed."""
+    return generate(tiny_model(), seed=3, steps=5)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from march_scenes import camera_at, gradients, one_box, random_boxes
+from march_scenes import assert_equals, camera_at, gradients, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cuda import graph as cuda_graph
@@ -25,8 +25,8 @@ INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 DEVICE = "cpu" if INTERPRETED else "cuda"
 WIDE = Shapes(tile=(16, 16), block=(16, 16), samples=32) if INTERPRETED else Shapes()
 """The interpreter takes as long for a large program as for a small one."""
-FACE_STEP = 3.4e-4
-"""The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
+ROUNDING = 2e-7
+"""Of a depth in float32, as a share of it."""
 ROUGH = MarchSettings(step=0.024, samples_per_voxel=1.0)
 """Few samples, to save the interpreter's time."""
 IN_ORDER = dataclasses.replace(ROUGH, compositing="index_order")
@@ -60,30 +60,10 @@ def draw(boxes, camera, settings=ROUGH, span=None, shapes=WIDE) -> Rendering:
     return picture.map(lambda tensor: tensor[0])
 
 
-def assert_equals(got: Rendering, expected: Rendering, densest: float, step: float) -> None:
-    """All fields within 2e-5 plus one flipped face sample of the densest box, on average within 2e-6."""
-    largest = 2e-5 + FACE_STEP * min(densest * step, 1)
-    got = got.to(device="cpu", dtype=torch.float64)
-    for name in ("rgb", "alpha"):
-        difference = (getattr(got, name) - getattr(expected, name)).abs()
-        assert difference.max() < largest, name
-        assert difference.mean() < 2e-6, name
-    clear = expected.alpha > 1e-2
-    assert torch.equal(torch.isinf(got.depth)[clear], torch.isinf(expected.depth)[clear])
-    rounding = 2e-7 * expected.depth[clear]
-    assert ((got.depth - expected.depth)[clear].abs() <= largest / expected.alpha[clear] + rounding).all()
-    decided = (got.alpha - 0.5).abs() > 2 * largest
-    both = decided & torch.isfinite(expected.first_hit)
-    assert torch.equal(torch.isinf(got.first_hit)[decided], torch.isinf(expected.first_hit)[decided])
-    # A sum that stands at 0.5 to rounding may reach it one sample later.
-    late = (got.first_hit - expected.first_hit)[both].abs() > 1e-6 + 2e-7 * expected.first_hit[both]
-    assert late.double().mean() < 0.01 if both.any() else True
-
-
 def assert_agree(boxes, camera, settings=ROUGH, span=None, shapes=WIDE) -> None:
     expected = march_reference(double(boxes), double(camera), settings, None if span is None else double(span))
     densest = float(boxes.density.max()) if boxes.density.numel() else 0.0
-    assert_equals(draw(boxes, camera, settings, span, shapes), expected, densest, settings.step)
+    assert_equals(draw(boxes, camera, settings, span, shapes), expected, densest, settings.step, ROUNDING)
 
 
 def mixed_sizes(count: int, seed: int, density: float) -> Primitives:
@@ -239,7 +219,7 @@ def test_a_batch_draws_each_person_from_each_view(settings, density):
     )
     for i, (person, view) in enumerate(scenes):
         expected = march_reference(double(person), double(view), settings)
-        assert_equals(got.map(lambda tensor, i=i: tensor[i]), expected, density, settings.step)
+        assert_equals(got.map(lambda tensor, i=i: tensor[i]), expected, density, settings.step, ROUNDING)
         assert expected.alpha.max() > 0.1
 
 

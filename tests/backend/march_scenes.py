@@ -9,6 +9,9 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import Rendering
 from torch import Tensor
 
+FACE_STEP = 3.4e-4
+"""The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
+
 
 def random_boxes(
     count: int,
@@ -74,6 +77,29 @@ def gradients(
     boxes, camera = (record.map(lambda tensor: tensor.detach().clone().requires_grad_()) for record in (boxes, camera))
     leaves = {**vars(boxes), "intrinsics": camera.intrinsics, "world_to_camera": camera.world_to_camera}
     return dict(zip(leaves, torch.autograd.grad(value(render(boxes, camera)), list(leaves.values())), strict=True))
+
+
+def assert_equals(got: Rendering, expected: Rendering, densest: float, step: float, rounding: float = 0.0) -> None:
+    """All fields within 2e-5 plus one flipped face sample of the densest box, on average within 2e-6.
+
+    Depths may be off by a share of `rounding` more.
+    """
+    largest = 2e-5 + FACE_STEP * min(densest * step, 1)
+    got = got.to(device="cpu", dtype=torch.float64)
+    for name in ("rgb", "alpha"):
+        difference = (getattr(got, name) - getattr(expected, name)).abs()
+        assert difference.max() < largest, name
+        assert difference.mean() < 2e-6, name
+    clear = expected.alpha > 1e-2
+    assert torch.equal(torch.isinf(got.depth)[clear], torch.isinf(expected.depth)[clear])
+    apart = (got.depth - expected.depth)[clear].abs()
+    assert (apart <= largest / expected.alpha[clear] + rounding * expected.depth[clear]).all()
+    decided = (got.alpha - 0.5).abs() > 2 * largest
+    both = decided & torch.isfinite(expected.first_hit)
+    assert torch.equal(torch.isinf(got.first_hit)[decided], torch.isinf(expected.first_hit)[decided])
+    # A sum that stands at 0.5 to rounding may reach it one sample later.
+    late = (got.first_hit - expected.first_hit)[both].abs() > 1e-6 + rounding * expected.first_hit[both]
+    assert late.double().mean() < 0.01 if both.any() else True
 
 
 def assert_same_direction_and_length(got: Tensor, expected: Tensor, name: object) -> None:

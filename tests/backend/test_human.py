@@ -9,17 +9,12 @@ from primdiffusion.body.model import BodyModel, BodyPose, default_body, measure,
 from primdiffusion.formats.body_layout import LARGEST_STRETCH
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, polar
-from primdiffusion.human import Human, framing, generate, place, place_skinned, pose_body
+from primdiffusion.human import framing, generate, place, place_skinned, pose_body
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K, Primitives
 from primdiffusion.render.march import march
 from support.errors import refused
 from support.tiny import FULL_DENSITY, tiny_model
-
-
-@pytest.fixture(scope="module")
-def human() -> Human:
-    return generate(tiny_model(), seed=3, steps=5)
 
 
 def bent(joint: int, angle: float) -> BodyPose:

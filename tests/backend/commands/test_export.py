@@ -18,12 +18,11 @@ from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.requests import GaussiansRequest, MergeRequest, PosedPerson, ProxyRequest
-from primdiffusion.human import generate, place, pose_body
+from primdiffusion.human import place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge as merge_boxes
 from primdiffusion.runtime.failures import MissingPackageError
 from support.errors import refused
-from support.tiny import tiny_model
 
 COARSE = ["--triangles", "800", "--texture", "64", "--spacing", "0.03"]
 
@@ -119,11 +118,6 @@ STILL = torch.eye(3, 4).tolist()
 
 def pose(seed: int) -> BodyPose:
     return BodyPose.from_axis_angle(0.3 * torch.randn(72, generator=torch.Generator().manual_seed(seed)))
-
-
-@pytest.fixture(scope="module")
-def human():
-    return generate(tiny_model(), seed=3, steps=5)
 
 
 @pytest.fixture

@@ -13,20 +13,14 @@ from primdiffusion.commands.render import FrameDrawer, map_frame
 from primdiffusion.drawing import Scene, ViewSettings, draw
 from primdiffusion.editing.reshaping import reshape_human
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
-from primdiffusion.human import framing, generate, place, pose_body
+from primdiffusion.human import framing, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.runtime.failures import to_user_error
 from support.errors import refused
-from support.tiny import tiny_model
 
 WIDTH, HEIGHT = 40, 56
 STILL = torch.eye(3, 4).tolist()
-
-
-@pytest.fixture(scope="module")
-def human():
-    return generate(tiny_model(), seed=3, steps=5)
 
 
 @pytest.fixture(scope="module")

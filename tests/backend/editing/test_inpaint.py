@@ -8,28 +8,29 @@ from primdiffusion.editing.inpaint import add_noise, paste_after_steps, renoise,
 from support.tiny import tiny_model
 
 SCHEDULE = linear()
+CHAIN = trailing_steps(SCHEDULE.length, 12)
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+KNOWN = 3 + 2 * torch.randn(1, 4, 64, 64, generator=generator(1))
+START = torch.randn(KNOWN.shape, generator=generator(2))
+INSIDE = (torch.arange(64) >= 40).expand(64, 64)
+
+
 @pytest.mark.parametrize("resamples", [1, 2])
 def test_the_denoiser_always_sees_the_outside_with_the_noise_of_the_step_it_is_asked_about(resamples):
-    known = 3 + 2 * torch.randn(1, 4, 64, 64, generator=generator(1))
-    inside = torch.zeros(64, 64, dtype=torch.bool)
-    inside[:, 40:] = True
     seen = []
 
     def denoise(x, t):
-        noise = ((x - SCHEDULE.signal(t) * known) / SCHEDULE.noise(t))[..., ~inside]
+        noise = ((x - SCHEDULE.signal(t) * KNOWN) / SCHEDULE.noise(t))[..., ~INSIDE]
         seen.append((t, float(noise.mean()), float(noise.std())))
         return torch.zeros_like(x)
 
-    chain = trailing_steps(SCHEDULE.length, 12)
-    start = torch.randn(known.shape, generator=generator(2))
-    steps = list(repaint(denoise, SCHEDULE, start, known, inside, chain, generator(3), resamples))
-    assert {t for t, _, _ in seen} == set(chain)
+    steps = list(repaint(denoise, SCHEDULE, START, KNOWN, INSIDE, CHAIN, generator(3), resamples))
+    assert {t for t, _, _ in seen} == set(CHAIN)
     assert len(seen) == len(steps) == steps[0].total
     for t, mean, std in seen:
         assert abs(mean) < 0.05, t
@@ -50,25 +51,20 @@ def test_what_a_step_leaves_outside_has_the_noise_of_the_level_it_leads_to():
 
 def test_as_released_the_outside_is_one_step_noisier_than_the_denoiser_is_told():
     """The known region is pasted at the wrong noise level by one step (SPEC 3), and no step is sampled twice."""
-    known = 3 + 2 * torch.randn(1, 4, 64, 64, generator=generator(1))
-    inside = torch.zeros(64, 64, dtype=torch.bool)
-    inside[:, 40:] = True
     seen = []
 
     def denoise(x, t):
-        seen.append((t, x[..., ~inside]))
+        seen.append((t, x[..., ~INSIDE]))
         return torch.zeros_like(x)
 
-    chain = trailing_steps(SCHEDULE.length, 12)
-    start = torch.randn(known.shape, generator=generator(2))
-    steps = list(paste_after_steps(denoise, SCHEDULE, start, known, inside, chain, generator(3)))
-    assert [t for t, _ in seen] == chain
+    steps = list(paste_after_steps(denoise, SCHEDULE, START, KNOWN, INSIDE, CHAIN, generator(3)))
+    assert [t for t, _ in seen] == CHAIN
     assert [(step.index, step.total) for step in steps] == [(index, 12) for index in range(12)]
-    assert torch.equal(seen[0][1], start[..., ~inside])
-    for before, (t, outside) in zip(chain, seen[1:], strict=False):
-        added = outside - SCHEDULE.signal(before) * known[..., ~inside]
+    assert torch.equal(seen[0][1], START[..., ~INSIDE])
+    for before, (t, outside) in zip(CHAIN, seen[1:], strict=False):
+        added = outside - SCHEDULE.signal(before) * KNOWN[..., ~INSIDE]
         assert float(added.std()) == pytest.approx(SCHEDULE.noise(before), rel=0.03), t
-    assert torch.equal(steps[-1].x0[..., ~inside], known[..., ~inside])
+    assert torch.equal(steps[-1].x0[..., ~INSIDE], KNOWN[..., ~INSIDE])
 
 
 def test_noise_added_on_the_way_up_makes_a_sample_of_the_upper_level():
@@ -89,30 +85,20 @@ def correlated(covariance: torch.Tensor):
     return denoise
 
 
-def inside_mean(resamples: int) -> float:
+def inside_mean(paint, *resamples: int) -> float:
     """Mean of one of a pair when the other is known to be 1.5; their correlation is 0.9."""
-    covariance = torch.tensor([[1.0, 0.9], [0.9, 1.0]])
+    denoise = correlated(torch.tensor([[1.0, 0.9], [0.9, 1.0]]))
     known = torch.tensor([1.5, 0.0]).expand(20000, 1, 1, 2)
     inside = torch.tensor([[False, True]])
     start, chain = torch.randn(known.shape, generator=generator(4)), trailing_steps(SCHEDULE.length, 30)
-    denoise = correlated(covariance)
-    *_, step = repaint(denoise, SCHEDULE, start, known, inside, chain, generator(5), resamples)
-    return float(step.x0[..., 1].mean())
-
-
-def released_inside_mean() -> float:
-    """As `inside_mean`, with the released code's mask."""
-    known = torch.tensor([1.5, 0.0]).expand(20000, 1, 1, 2)
-    start, chain = torch.randn(known.shape, generator=generator(4)), trailing_steps(SCHEDULE.length, 30)
-    denoise = correlated(torch.tensor([[1.0, 0.9], [0.9, 1.0]]))
-    *_, step = paste_after_steps(denoise, SCHEDULE, start, known, torch.tensor([[False, True]]), chain, generator(5))
+    *_, step = paint(denoise, SCHEDULE, start, known, inside, chain, generator(5), *resamples)
     return float(step.x0[..., 1].mean())
 
 
 def test_the_more_often_steps_are_sampled_the_better_the_inside_fits_the_outside():
     fits = 0.9 * 1.5
-    assert fits - released_inside_mean() > fits - inside_mean(2)
-    misses = [fits - inside_mean(resamples) for resamples in (1, 2, 5)]
+    misses = [fits - inside_mean(repaint, resamples) for resamples in (1, 2, 5)]
+    assert fits - inside_mean(paste_after_steps) > misses[1], "as released"
     assert misses[0] > misses[1] > misses[2] > 0
     assert misses[2] < 0.35 * misses[0]
 

@@ -2,21 +2,14 @@
 
 import dataclasses
 
-import pytest
 import torch
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.editing.reshaping import SHARE, box_growth, reshape_human
-from primdiffusion.human import Human, generate, place
+from primdiffusion.human import place
 from primdiffusion.primitives.anchors import Anchors, cell_sides, default_anchors
 from support.errors import refused
-from support.tiny import tiny_model
 
 WIDER = torch.tensor([0.3, 2.6, 1.0, 2.2, 0.3, 4.0, 1.5, -1.7, -0.4, -0.3])
-
-
-@pytest.fixture(scope="module")
-def human() -> Human:
-    return generate(tiny_model(), seed=3, steps=5)
 
 
 def stretched_body(along: torch.Tensor) -> BodyModel:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from march_scenes import assert_same_direction_and_length, gradients, objective
+from march_scenes import FACE_STEP, assert_same_direction_and_length, gradients, objective
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.primitives.primitives import Primitives
@@ -16,8 +16,6 @@ from primdiffusion.render.lattice import MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from torch import Tensor
 
-FACE_STEP = 3.4e-4
-"""The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
 LATTICES = ((4, 2, 1), (1,), (2, 1), (4,), (6, 3, 1))
 PICTURES = ((24, 20), (1, 1), (3, 37), (40, 1), (1, 33), (17, 9))
 

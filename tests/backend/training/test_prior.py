@@ -115,10 +115,14 @@ def components(spread=0.1):
     return c
 
 
+def fitted(people, c, config=CONFIG, **counted):
+    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in people])
+    return SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, config, ONE_EACH, **counted))
+
+
 @pytest.fixture(scope="module")
 def mixture():
-    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in PEOPLE])
-    return SimpleNamespace(**fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG, ONE_EACH))
+    return fitted(PEOPLE, components())
 
 
 def part(mixture, **asked):
@@ -159,11 +163,10 @@ def test_shares_are_those_of_the_people_given_the_sex(mixture):
 
 def test_further_people_do_not_make_their_kind_more_frequent(mixture):
     further = [{"sex": "male", "outfit": "jeans", "hair": "crew", "shoes": "pumps"}] * 300
-    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in (*PEOPLE, *further)])
     c = torch.cat([components(), torch.zeros(300, CLOTHES + 2)])
-    both = SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, CONFIG, ONE_EACH, counted=len(PEOPLE)))
+    both = fitted([*PEOPLE, *further], c, counted=len(PEOPLE))
     torch.testing.assert_close(both.log_weight.exp(), mixture.log_weight.exp())
-    unseen = SimpleNamespace(**fit_mixture(c.flip(0), CLOTHES, condition.flip(0), WORDS, CONFIG, ONE_EACH, counted=300))
+    unseen = fitted([*further, *PEOPLE[::-1]], c.flip(0), counted=300)
     assert unseen.log_weight.exp()[part(unseen, **further[0])] == pytest.approx(1)
     assert (unseen.log_weight > IMPOSSIBLE / 2).sum() == 1
 
@@ -190,11 +193,6 @@ def test_heads_keep_the_variance_of_their_hair(mixture):
         spread.append((own + mixture.head_shared[head, 1:].square().sum(0))[1])
     assert spread[0].item() == pytest.approx(1.0, rel=0.3)
     assert spread[1] < 0.2
-
-
-def fitted(people, c, config=CONFIG):
-    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in people])
-    return SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, config, ONE_EACH))
 
 
 def test_what_happens_to_go_with_hair_and_skin_does_not_colour_clothes():

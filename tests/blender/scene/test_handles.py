@@ -156,15 +156,20 @@ def assert_each(before, armature, frames) -> None:
         assert_same(expected, seen)
 
 
-def test_a_walk_stays_the_same_with_handles_and_after_baking(armature):
+@pytest.mark.parametrize(("strips", "curves"), [(False, 25), (True, 12)], ids=["action", "strips"])
+def test_a_walk_stays_the_same_with_handles_and_after_baking_into_an_action_above_any_strips(armature, strips, curves):
     frames = walking(armature)
+    if strips:
+        animation = armature.animation_data
+        strip = animation.nla_tracks.new().strips.new("walk", int(frames[0]), animation.action)
+        strip.action_slot, animation.action = animation.action_slot, None
     before = each(armature, frames)
     add_handles(bpy.context, armature)
     assert_each(before, armature, frames)
     bake_handles(bpy.context, armature)
     assert_each(before, armature, frames)
     paths = {curve.data_path for curve in action_curves(armature)}
-    assert len(paths) == 25, "24 rotations and the pelvis' location"
+    assert len(paths) == curves, "24 rotations and the pelvis' location; above strips the rotations of the limbs"
 
 
 def test_handles_of_scaled_bones_turn_as_the_bones_do(armature):
@@ -208,18 +213,6 @@ def test_handles_keyed_by_hand_are_baked_between_their_keys(armature):
     bake_handles(bpy.context, armature)
     assert_each(shown, armature, range(1, 12))
     assert not [curve for curve in action_curves(armature) if "_ik" in curve.data_path]
-
-
-def test_strips_of_the_nonlinear_animation_are_baked_into_an_action_above_them(armature):
-    frames = walking(armature)
-    animation = armature.animation_data
-    strip = animation.nla_tracks.new().strips.new("walk", int(frames[0]), animation.action)
-    strip.action_slot, animation.action = animation.action_slot, None
-    before = each(armature, frames)
-    add_handles(bpy.context, armature)
-    assert_each(before, armature, frames)
-    bake_handles(bpy.context, armature)
-    assert_each(before, armature, frames)
 
 
 def test_an_action_that_another_human_uses_is_left_alone(armature, joints):

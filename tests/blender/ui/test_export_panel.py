@@ -11,12 +11,9 @@ import exporting
 import numpy as np
 import pytest
 import synthetic
-from backend_python import use_this_python
 from jobs_driven import Layout
 from support.errors import refused
-from support.fake_child import FAKE_CHILD
 
-import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.human import BETAS, BODY_FILE, humans, proxy_of
 from blender_primdiffusion.scene.human_file import read_tensors
@@ -30,16 +27,13 @@ OPERATORS = bpy.ops.primdiffusion
 
 
 @pytest.fixture
-def store(saved_scene, tmp_path, monkeypatch):
-    """The add-on registered on an interpreter that runs the fake child."""
+def store(addon, tmp_path, monkeypatch):
+    """A folder with a person and its meshes, which the fake child has ready."""
     folder = tmp_path / "store"
     folder.mkdir()
     exporting.write_store(folder)
     monkeypatch.setenv("FAKE_HUMAN", str(folder / "person.human.safetensors"))
-    use_this_python(monkeypatch, FAKE_CHILD)
-    blender_primdiffusion.register()
-    yield folder
-    blender_primdiffusion.unregister()
+    return folder
 
 
 @pytest.fixture

@@ -6,17 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from march_scenes import camera_at, one_box, random_boxes
+from march_scenes import assert_equals, camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu.march import _scene, _view, count_samples, march_cpu
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
-
-FACE_STEP = 3.4e-4
-"""The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
-
 
 INDEX_ORDER = MarchSettings(compositing="index_order")
 
@@ -27,25 +23,10 @@ def assert_agree(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     span: Span | None = None,
 ) -> None:
-    """All fields within 2e-5 plus one flipped face sample of the densest box, on average within 2e-6."""
     got = march_cpu(boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32), settings, span)
     expected = march_reference(boxes.to(dtype=torch.float32).to(dtype=torch.float64), camera, settings, span)
     densest = float(boxes.density.max()) if boxes.density.numel() else 0.0
-    largest = 2e-5 + FACE_STEP * min(densest * settings.step, 1)
-    for name in ("rgb", "alpha"):
-        difference = (getattr(got, name).double() - getattr(expected, name)).abs()
-        assert difference.max() < largest, name
-        assert difference.mean() < 2e-6, name
-    clear = expected.alpha > 1e-2
-    assert torch.equal(torch.isinf(got.depth)[clear], torch.isinf(expected.depth)[clear])
-    assert ((got.depth - expected.depth)[clear].abs() <= largest / expected.alpha[clear]).all()
-    near_half = 2 * largest
-    decided = (got.alpha - 0.5).abs() > near_half
-    both = decided & torch.isfinite(expected.first_hit)
-    assert torch.equal(torch.isinf(got.first_hit)[decided], torch.isinf(expected.first_hit)[decided])
-    # A sum that stands at 0.5 to rounding may reach it one sample later.
-    late = (got.first_hit - expected.first_hit)[both].abs() > 1e-6
-    assert late.float().mean() < 0.01 if both.any() else True
+    assert_equals(got, expected, densest, settings.step)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -69,18 +69,16 @@ def request(gpu: SlowGpu, key: object) -> MarchRequest:
     return MarchRequest(key, VIEW, gpu.begin)
 
 
-def refined(gpu: SlowGpu, key: object = "a") -> GpuRefinement:
+def refined(gpu: SlowGpu) -> tuple[GpuRefinement, list[tuple[int, int]]]:
+    """A picture to its end, and what was shown on the way."""
     refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, key))
-    gpu.refine_to_the_end(refinement)
-    return refinement
+    refinement.want(request(gpu, "a"))
+    return refinement, gpu.refine_to_the_end(refinement)
 
 
 def test_a_picture_is_refined_and_antialiased_when_nothing_moves():
     gpu = SlowGpu(1e-6)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, "a"))
-    shown = gpu.refine_to_the_end(refinement)
+    refinement, shown = refined(gpu)
     assert shown == [*((coarseness, 0) for coarseness in COARSENESS), *((1, n) for n in range(1, SAMPLES))]
     assert gpu.sizes[:4] == [(80, 60), (160, 120), (320, 240), (640, 480)]
     assert gpu.longest < 2 * SLICE_S
@@ -88,15 +86,13 @@ def test_a_picture_is_refined_and_antialiased_when_nothing_moves():
 
 
 def test_a_fast_gpu_skips_what_it_does_not_need():
-    gpu = SlowGpu(1e-7)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, "a"))
-    assert gpu.refine_to_the_end(refinement)[:3] == [(8, 0), (1, 0), (1, 1)]
+    _, shown = refined(SlowGpu(1e-7))
+    assert shown[:3] == [(8, 0), (1, 0), (1, 1)]
 
 
 def test_a_fast_gpu_marches_in_full_while_the_view_moves():
     gpu = SlowGpu(1e-9)
-    refinement = refined(gpu)
+    refinement, _ = refined(gpu)
     for key in range(1, 4):
         refinement.want(request(gpu, key))
         assert refinement.advance()
@@ -122,7 +118,7 @@ def test_the_first_call_after_any_change_shows_a_whole_picture_of_the_new_view(p
 
 def test_a_gpu_that_has_become_slow_is_noticed_at_the_first_picture():
     gpu = SlowGpu(1e-7)
-    refinement = refined(gpu)
+    refinement, _ = refined(gpu)
     gpu.pixel_s = 2e-6
     for key, coarseness in (("b", 1), ("c", 4)):
         refinement.want(request(gpu, key))
@@ -150,10 +146,7 @@ def test_a_human_below_empty_rows_does_not_stall_the_window():
 
 
 def test_a_slow_gpu_averages_fewer_pictures():
-    gpu = SlowGpu(1e-5)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, "a"))
-    shown = gpu.refine_to_the_end(refinement)
+    _, shown = refined(SlowGpu(1e-5))
     assert shown[-1] == (1, SLOW_SAMPLES - 1)
 
 
@@ -174,7 +167,7 @@ def test_a_finer_picture_is_abandoned_when_the_view_moves():
 
 def test_an_equal_request_changes_nothing_and_rays_stay_in_their_pixels():
     gpu = SlowGpu(1e-6)
-    refinement = refined(gpu)
+    refinement, _ = refined(gpu)
     refinement.want(request(gpu, "a"))
     assert refinement.resting
     assert jittered(VIEW, 0) is VIEW
