@@ -16,6 +16,7 @@ from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
 from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, open_assets, parse_mhclo
 from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.colours import lab_from_bytes
 from primdiffusion.people.fitting import shown_faces, skin_under_hem, skirt_faces, under_hat
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
 from primdiffusion.people.person import make_person, recolour
@@ -60,6 +61,15 @@ def test_tops_have_no_lettering(assets, base, name):
 def test_striped_tops_have_no_bright_spots(assets, base, name):
     fabric, top = shaded_top(assets, base, name)
     assert np.quantile(fabric.shade[top], 0.99) < 1.3
+
+
+def test_the_tie_of_a_suit_is_plain(assets, base):
+    garment = next(each for each in OUTFITS["male"] if each.name == "male_elegantsuit01")
+    fabric = garments.cloth(assets, base, garment)
+    tie = (lab_from_bytes(fabric.original[..., :3])[..., 2] < -10) & (fabric.piece == 0)
+    assert tie.sum() > 100  # blue in the pack, on a grey suit with a white shirt
+    assert fabric.trim[tie].mean() < 0.02
+    assert fabric.shade[tie].std() < 0.1 < fabric.shade[fabric.trim].std()
 
 
 def same_pictures(first, second):
