@@ -8,8 +8,10 @@ what is generated has colours as often as people have them.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 
 import torch
+from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
@@ -31,19 +33,26 @@ def with_colour_pairs(
 
     A surface that few of them have keeps the colours that it has.
     """
-    count, with_attributes = int(people.detailed), prior.kind.shape[-1] == surfaces.condition.shape[1]
-    of_people: dict[int, list[Tensor]] = {}
-    for latents, kind in zip(people.latents[:count], people.condition[:count], strict=True):
-        for surface, colour in surfaces.colours(codec.decode(latents[None].float())[0], kind).items():
-            of_people.setdefault(surface, []).append(colour)
+    count = int(people.detailed)
+    of_people = _by_surface(
+        surfaces.colours(codec.decode(latents[None].float())[0], kind)
+        for latents, kind in zip(people.latents[:count], people.condition[:count], strict=True)
+    )
+    of_draws: dict[int, list[Tensor]] = {}
     pairs = []
     for surface, colours in sorted(of_people.items()):
-        if len(colours) >= FEWEST_COLOURS and with_attributes:
-            drawn = _drawn(surfaces, surface, codec, prior, generator)
-            worn = torch.stack(colours)[torch.randperm(len(colours), generator=generator)]
-            worn = worn[torch.arange(len(drawn)) % len(worn)]
-            rows, columns = linear_sum_assignment(torch.cdist(drawn.double(), worn.double()).square().numpy())
-            pairs.append((torch.full((len(rows),), surface), drawn[rows], worn[columns]))
+        if len(colours) < FEWEST_COLOURS:
+            continue
+        missing = DRAWS - len(of_draws.get(surface, ()))
+        made = (_draw(surfaces, surface, codec, prior, generator) for _ in range(missing))
+        for other, more in _by_surface(made).items():
+            of_draws.setdefault(other, []).extend(more)
+        if surface not in of_draws:  # no kind of the prior has it
+            continue
+        drawn, worn = torch.stack(of_draws[surface][:DRAWS]), torch.stack(colours)
+        worn = worn[torch.randperm(len(worn), generator=generator)][torch.arange(len(drawn)) % len(worn)]
+        rows, columns = linear_sum_assignment(torch.cdist(drawn.double(), worn.double()).square().numpy())
+        pairs.append((torch.full((len(rows),), surface), drawn[rows], worn[columns]))
     if not pairs:
         return surfaces
     kept = ~torch.isin(surfaces.paired, torch.cat([surface for surface, *_ in pairs]))
@@ -52,15 +61,18 @@ def with_colour_pairs(
     return dataclasses.replace(surfaces, paired=paired, sampled=sampled, worn=worn)
 
 
-def _drawn(
+def _draw(
     surfaces: Surfaces, surface: int, codec: LinearCodec, prior: PersonPrior, generator: torch.Generator
-) -> Tensor:
-    """Colours of the surface on draws of people who have it [n, 3]."""
-    colours = []
-    for _ in range(DRAWS):
-        kind = prior.sample_kinds(1, generator, surfaces.condition[surface : surface + 1])
-        cells = codec.decode(prior.sample(1, generator, kind))
-        found = surfaces.colours(cells[0], kind[0])
-        if surface in found:
-            colours.append(found[surface])
-    return torch.stack(colours) if colours else torch.zeros(0, 3)
+) -> dict[int, Float[Tensor, "3"]]:
+    """Colours of the surfaces of a draw of people who have this one."""
+    kind = prior.sample_kinds(1, generator, surfaces.condition[surface : surface + 1])
+    return surfaces.colours(codec.decode(prior.sample(1, generator, kind))[0], kind[0])
+
+
+def _by_surface(people: Iterable[Mapping[int, Float[Tensor, "3"]]]) -> dict[int, list[Float[Tensor, "3"]]]:
+    """The colours of each surface on those who have it."""
+    found: dict[int, list[Float[Tensor, "3"]]] = {}
+    for colours in people:
+        for surface, colour in colours.items():
+            found.setdefault(surface, []).append(colour)
+    return found
