@@ -11,7 +11,7 @@ from packaging.metadata import Metadata
 from support.wheel import ROOT, build_archives, sources
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-LARGEST_ON_PYPI = 100_000_000
+LARGEST_ON_PYPI = 100 * 2**20
 """Bytes of a file on PyPI, unless more is asked for."""
 
 

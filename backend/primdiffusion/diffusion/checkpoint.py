@@ -51,7 +51,7 @@ ENCODER_FORMAT = "primdiffusion-encoder"
 """Format of the files of `encoder.model`."""
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
-_HALVED = ("codec.mean", "codec.basis", "denoiser.")
+_HALVED = ("codec.mean", "codec.basis", "denoiser.", "surfaces.sampled", "surfaces.worn")
 _WHOLE = ("prior_variance", "prior_head_variance", "prior_log_weight")
 WEIGHTS = "model.safetensors"
 """The checkpoint in a folder of `save_pretrained` or of `hf download`."""
