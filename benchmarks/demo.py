@@ -22,8 +22,8 @@ from primdiffusion.runtime.machine import share_processors
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 FRAMES, SHOWN = 48, 31
-SEED = 10
-"""A human of the included checkpoint with a clear face, even cloth and a clean collar: the seventh of seeds 0 to 63 by
+SEED = 57
+"""A human of the included checkpoint with a clear face, even cloth and a clean collar: the fourth of seeds 0 to 63 by
 how close its pictures are to those of meshes (`scripts/feature_space`)."""
 PRINT_S = 5.0
 """Seconds between lines of progress."""

@@ -96,7 +96,7 @@ def generate(
     `on_step` is called after each step; raise an exception from it to cancel.
     `end` is the level at which the sampler ddim ends: `samplers.RELEASED_END` as in the released code.
 
-        >>> human = pd.generate(model, seed=10)
+        >>> human = pd.generate(model, seed=57)
         >>> human.payload.density.shape  # boxes, and the voxels along their sides
         torch.Size([1024, 8, 8, 8])
 
