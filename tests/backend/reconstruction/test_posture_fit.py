@@ -191,7 +191,7 @@ def test_a_bow_that_a_pose_file_states_stays():
     fit.refine(PAYLOAD, seen(bow), Stage(40, 0.02))
     found, true = (pose_body(one.betas, next(each(one.pose))).joints[:, :3, 3] for one in (fit.posture(), bow))
     turned = [places[JOINT_NAMES.index("neck")] - places[0] for places in (found, true)]
-    assert torch.cosine_similarity(*turned, dim=0) > math.cos(math.radians(4))
+    assert torch.cosine_similarity(*turned, dim=0) > math.cos(math.radians(6))
 
 
 def test_what_pictures_do_not_show_stays_where_it_was():
