@@ -98,7 +98,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
             lab = lab_from_bytes(original[..., :3])
             distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.array([0.8, 1, 1], np.float64), axis=-1)
             other = here & (distance > TRIM_DISTANCE)
-        if kind.trim and kind.smooth:
+        if original is not None and kind.trim and kind.smooth:
             tie = here & np.asarray(
                 binary_closing(np.hypot(lab[..., 1], lab[..., 2]) > TIE_CHROMA, np.ones((5, 5)), 2), bool
             )
