@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 from diffusion_people import small_model
-from primdiffusion.diffusion.surfaces import Surfaces, without_faces_and_skirts
+from primdiffusion.diffusion.surfaces import Surfaces, optional_fields
 from primdiffusion.training.latents import LatentSet
 
 from scripts.renew_closed_form import joined, picked, with_clothes, with_prior
@@ -49,7 +49,7 @@ def clothes(outfits, cells, printed):
     return Surfaces(
         outfits, flags, torch.arange(count), torch.tensor(cells), torch.rand(count, 512), torch.rand(count, 512),
         flags, flags, torch.tensor(printed), torch.arange(prints), torch.tensor(printed), torch.rand(prints, 512),
-        **{**without_faces_and_skirts(), "paired": torch.arange(count), "sampled": outfits, "worn": 1 - outfits},
+        **{**optional_fields(), "paired": torch.arange(count), "sampled": outfits, "worn": 1 - outfits},
     )  # fmt: skip
 
 

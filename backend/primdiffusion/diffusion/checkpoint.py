@@ -30,7 +30,7 @@ from primdiffusion.diffusion.model import (
     check_surfaces,
 )
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
-from primdiffusion.diffusion.surfaces import LARGEST, NUMBERS, Surfaces, without_faces_and_skirts
+from primdiffusion.diffusion.surfaces import LARGEST, NUMBERS, Surfaces, optional_fields
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.files import tensor_file
 from primdiffusion.files.arrays import LARGEST_NUMBER
@@ -343,7 +343,7 @@ def restore_surfaces(tensors: Mapping[str, Tensor], vocabulary: AttributeVocabul
     """Undo `store_surfaces`; None without any. Raises ValueError, KeyError and TypeError where tensors do not fit."""
     if not tensors:
         return None
-    tensors = {**without_faces_and_skirts(), **tensors}  # earlier checkpoints have neither, and store all shares
+    tensors = {**optional_fields(), **tensors}  # earlier checkpoints have neither, and store all shares
     whole = tensors.pop("whole", torch.zeros(len(tensors["cell"]))).bool()
     numbers = {name: tensors[name].long() for name in NUMBERS}
     flags = {name: tensors[name].bool() for name in ("natural", "read", "drawn")}

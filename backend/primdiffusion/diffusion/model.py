@@ -196,7 +196,7 @@ class DiffusionModel:
     def _recoloured(
         self,
         prior: PersonPrior,
-        x0: Float[Tensor, "b c h w"],
+        samples: Float[Tensor, "b c h w"],
         kind: Float[Tensor, "b a"],
         colours: Callable[[Tensor, Tensor], Float[Tensor, "2 q 3"]],
     ) -> Float[Tensor, "b c h w"]:
@@ -205,27 +205,21 @@ class DiffusionModel:
 
         A Gaussian has hair darker than black, and then foreheads that make up for it by pale spots.
         """
-        return torch.cat([self._with_colours(prior, *each, colours) for each in zip(x0, kind, strict=True)])
-
-    def _with_colours(
-        self,
-        prior: PersonPrior,
-        x0: Float[Tensor, "c h w"],
-        kind: Float[Tensor, "a"],
-        colours: Callable[[Tensor, Tensor], Float[Tensor, "2 q 3"]],
-    ) -> Float[Tensor, "1 c h w"]:
         assert isinstance(self.codec, CellCodec)
-        coefficients, _ = prior.split(x0[None])
-        codec = self.codec.codec
-        with torch.inference_mode(False), torch.enable_grad():
-            cells = codec.decode(x0.clone()).requires_grad_()
-            own, drawn = colours(cells, kind.clone()).flatten(1)
-            wanted = (drawn - own).detach()
-            if not (wanted.abs() > VISIBLE).any():
-                return x0[None]
-            by_cells = (torch.autograd.grad(value, cells, retain_graph=True)[0] for value in own)
-            slopes = prior.along(torch.stack([codec.pulled_back(each) for each in by_cells]))
-        return x0 + prior.picture(prior.moved(coefficients[0], slopes, wanted)[None] - coefficients)
+        codec, moved = self.codec.codec, []
+        for x0, its in zip(samples, kind, strict=True):
+            with torch.inference_mode(False), torch.enable_grad():
+                cells = codec.decode(x0.clone()).requires_grad_()
+                own, drawn = colours(cells, its.clone()).flatten(1)
+                by_cells = (torch.autograd.grad(value, cells, retain_graph=True)[0] for value in own)
+                wanted = (drawn - own).detach()
+                if (wanted.abs() > VISIBLE).any():
+                    slopes = prior.along(torch.stack([codec.pulled_back(each) for each in by_cells]))
+                    coefficients, _ = prior.split(x0[None])
+                    change = prior.moved(coefficients[0], slopes, wanted)[None] - coefficients
+                    x0 = x0 + prior.picture(change)[0]
+            moved.append(x0)
+        return torch.stack(moved)
 
     def read_condition(self, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b a"] | None:
         """Probabilities of attributes of clean samples, as a condition, with garments of one colour plain; None for a

@@ -258,8 +258,8 @@ class Surfaces(TensorRecord):
         return of_boxes[sure] if sure.any() else of_boxes.mean(0, keepdim=True)
 
 
-def without_faces_and_skirts() -> dict[str, Tensor]:
-    """Fields of surfaces that have no faces, no skirts and no pairs of colours."""
+def optional_fields() -> dict[str, Tensor]:
+    """Fields of surfaces without faces, skirts and pairs of colours, as in earlier checkpoints."""
     none = torch.zeros(0, dtype=torch.int64)
     voxels = torch.zeros(0, S**3)
     return {

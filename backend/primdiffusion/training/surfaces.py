@@ -23,9 +23,9 @@ from primdiffusion.diffusion.surfaces import (
     SURELY,
     Surfaces,
     density_weight,
+    optional_fields,
     seen,
     voxels_of,
-    without_faces_and_skirts,
 )
 from primdiffusion.editing.regions import region_of
 from primdiffusion.primitives.primitives import K, S
@@ -145,7 +145,7 @@ def fit_surfaces(
             garment.append(number)
             box.append(boxes[found_print.box])
             second.append(found_print.second)
-    fields = without_faces_and_skirts() | known.face()
+    fields = optional_fields() | known.face()
     if skirts:
         fields |= {name: torch.cat([getattr(skirt, name) for skirt in skirts]) for name in _Skirt._fields}
     return Surfaces(

@@ -60,6 +60,15 @@ def test_the_voxel_basis_is_what_decoding_adds(codec):
     assert torch.allclose(torch.einsum("kvxc,ck->kvx", basis, latents[:5].flatten(1)), added, atol=1e-4)
 
 
+def test_slopes_on_cells_become_those_on_latents(codec):
+    assert codec.weight.unique().numel() > 1
+    latents = torch.zeros(codec.channels, GRID, GRID, requires_grad=True)
+    slopes = torch.zeros(K, VALUES)
+    slopes[::100] = torch.rand(slopes[::100].shape, generator=torch.Generator().manual_seed(2))
+    (wanted,) = torch.autograd.grad((codec.decode(latents) * slopes).sum(), latents)
+    torch.testing.assert_close(codec.pulled_back(slopes), wanted, rtol=1e-4, atol=1e-4)
+
+
 def test_what_the_basis_spans_survives_the_round_trip(codec):
     latents = torch.randn(2, 16, GRID, GRID, generator=torch.Generator().manual_seed(3))
     assert torch.allclose(codec.encode(codec.decode(latents)), latents, atol=1e-4)

@@ -8,8 +8,9 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint, restore_surfaces
 from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.model import check_surfaces
-from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, LARGEST, Surfaces, voxels_of, without_faces_and_skirts
+from primdiffusion.diffusion.surfaces import BLACK, BRIGHTEST, LARGEST, Surfaces, optional_fields, voxels_of
 from primdiffusion.editing.regions import region_of
+from primdiffusion.human import decode_humans
 from primdiffusion.primitives.primitives import GRID, K, S
 from primdiffusion.primitives.skirts import box_sizes, inside_legs, voxel_heights
 from primdiffusion.training.colour_pairs import with_colour_pairs
@@ -512,7 +513,7 @@ def model_with_surfaces():
         torch.tensor([[1.0, 0, 1, 0]]), torch.tensor([True]), torch.zeros(5, dtype=torch.int64), torch.arange(40, 45),
         share, BRIGHTEST * tone, read, torch.ones_like(read),
         torch.zeros(1, dtype=torch.int64), torch.zeros(2, dtype=torch.int64),
-        torch.arange(2), torch.rand(2, S**3, generator=generator), **without_faces_and_skirts(),
+        torch.arange(2), torch.rand(2, S**3, generator=generator), **optional_fields(),
     )  # fmt: skip
     return dataclasses.replace(model, surfaces=surfaces), surfaces
 
@@ -572,6 +573,9 @@ def test_what_is_generated_has_the_colours_that_people_have_as_often_as_they_hav
     off = torch.stack([(made - each).abs().amax(1) for each in (dark, light)])
     assert float(off.amin(0).quantile(0.9)) < 0.1 * float((light - dark).mean())
     assert float((off[1] < off[0]).float().mean()) == pytest.approx(0.25, abs=0.1)
+    (person,), moved = decode_humans(model, drawn[:1], [0]), model.with_peoples_colours(drawn[:1])[0]
+    assert torch.equal(person.payload.rgb, model.decode(moved).rgb)
+    assert not torch.equal(person.payload.rgb, model.decode(drawn[0]).rgb)  # people who are encoded stay as they are
     few = dataclasses.replace(people, detailed=torch.tensor(3))
     assert not len(with_colour_pairs(surfaces, few, codec, prior, generator).paired)
 
@@ -594,7 +598,7 @@ def test_earlier_checkpoints_have_neither_faces_nor_skirts():
     model, surfaces = model_with_surfaces()
     tensors = store_surfaces({f"surfaces.{name}": value for name, value in vars(surfaces).items()})
     earlier = {name.removeprefix("surfaces."): value for name, value in tensors.items()}
-    for name in ("whole", *without_faces_and_skirts()):
+    for name in ("whole", *optional_fields()):
         del earlier[name]
     loaded = restore_surfaces(earlier, model.vocabulary)
     assert loaded is not None

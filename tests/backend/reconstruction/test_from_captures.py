@@ -10,7 +10,7 @@ from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import sample
-from primdiffusion.diffusion.surfaces import Surfaces, without_faces_and_skirts
+from primdiffusion.diffusion.surfaces import Surfaces, optional_fields
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.image import encode_srgb
@@ -77,7 +77,7 @@ def test_unseen_sides_have_surfaces_of_one_colour(plain):
         torch.zeros(1, MODEL.vocabulary.width), torch.tensor([False]), torch.zeros(2, dtype=torch.int64),
         torch.cat([front, back]), ones,
         torch.stack([ones[0], 0.5 * ones[0]]), torch.tensor([True, False]), torch.tensor([False, True]),
-        *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0], **without_faces_and_skirts(),
+        *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0], **optional_fields(),
     )  # fmt: skip
     person, free, _ = plain
     found = reconstruct(dataclasses.replace(MODEL, surfaces=surfaces), person)
@@ -97,7 +97,7 @@ def test_hair_on_the_back_has_the_colour_that_the_picture_shows_in_front():
     ones, yes = torch.ones(len(head), S**3), torch.ones(len(head), dtype=torch.bool)
     hair = Surfaces(
         torch.zeros(1, MODEL.vocabulary.width), torch.tensor([True]), torch.zeros(len(head), dtype=torch.int64),
-        head, ones, ones, yes, yes, *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0], **without_faces_and_skirts(),
+        head, ones, ones, yes, yes, *(torch.zeros(0, dtype=torch.int64),) * 3, ones[:0], **optional_fields(),
     )  # fmt: skip
     behind = head[primitives.position[head, 2] < primitives.position[head, 2].median() - 0.05]
     errors = []
